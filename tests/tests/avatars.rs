@@ -7,7 +7,7 @@ use flyrig_gpu::{AdapterChoice, GpuContext};
 use flyrig_stream::{Posed, PosedAxes};
 use flyrig_tests::{run, write_dataset};
 use flyrig_transport::TransportConfig;
-use flyrig_viewer::{Receiver, Scene, ShownPerson, clock_secs};
+use flyrig_viewer::{PeopleScene, Receiver, ShownPerson, clock_secs};
 
 const PROGRAM: &str = env!("CARGO_BIN_EXE_flyrig-under-test");
 const GIVEN: [&str; 4] = ["--pose", "given", "--masks", "given"];
@@ -268,7 +268,7 @@ fn the_live_rig_starts_from_an_avatar() {
         let colors = person.pose(&motion, &mut posed);
         assert!(person.pose_axes(&motion, &mut axes) && axes.rotation.len() == 4000);
         let gpu = GpuContext::new(&AdapterChoice::Best).unwrap().fastest();
-        let mut scene = Scene::new(&gpu).unwrap();
+        let mut scene = PeopleScene::new(&gpu).unwrap();
         scene.set_people([ShownPerson { posed: &posed, colors: &colors, axes: Some(&axes) }]).unwrap();
         let view = scene.draw(&camera).unwrap();
         let shown = view.rgba.chunks_exact(4).filter(|pixel| pixel[3] > 200).count();

@@ -19,7 +19,7 @@ use flyrig_renderer::composite_over;
 use flyrig_stream::{Motion, Posed, PosedAxes};
 use flyrig_tests::{Dataset, run, write_dataset};
 use flyrig_transport::TransportConfig;
-use flyrig_viewer::{Receiver, Scene, ShownPerson, clock_secs};
+use flyrig_viewer::{PeopleScene, Receiver, ShownPerson, clock_secs};
 use flyrig_viewing::Navigation;
 use serde_json::{Value, json};
 use support::{Process, small_rig, wait_until};
@@ -255,7 +255,7 @@ fn psnr_of_browser(who: Shown, drawing: &str, options: &[&str]) -> f64 {
     let has_axes = template.pose_axes(motion, &mut axes);
     assert_eq!(has_axes, who == Shown::Avatar);
     drop(state);
-    let mut scene = Scene::new(&gpu.fastest()).unwrap();
+    let mut scene = PeopleScene::new(&gpu.fastest()).unwrap();
     let mut draw = |axes: Option<&PosedAxes>| {
         scene.set_people([ShownPerson { posed: &posed, colors, axes }]).unwrap();
         scene.draw(&navigation.camera(SIDE, SIDE)).unwrap()

@@ -86,7 +86,9 @@ fn expand(text: &mut std::iter::Peekable<std::str::Chars<'_>>, mut head: Vec<Str
 /// Modules that `module` imports: by `crate::`, `super::`, `self::` or the name of a child.
 fn imports(module: &[String], code: &str, all: &BTreeMap<Vec<String>, PathBuf>) -> BTreeSet<Vec<String>> {
     let mut starts = vec!["crate".to_owned(), "super".to_owned(), "self".to_owned()];
-    starts.extend(all.keys().filter(|m| m.len() == module.len() + 1 && m.starts_with(module)).map(|m| m[module.len()].clone()));
+    starts.extend(
+        all.keys().filter(|m| m.len() == module.len() + 1 && m.starts_with(module)).map(|m| m[module.len()].clone()),
+    );
     let mut found = BTreeSet::new();
     for start in &starts {
         for (at, _) in code.match_indices(&format!("{start}::")) {
@@ -110,7 +112,8 @@ fn imports(module: &[String], code: &str, all: &BTreeMap<Vec<String>, PathBuf>) 
                     steps = &steps[1..];
                 }
                 base.extend_from_slice(steps);
-                let known = (1..=base.len()).rev().map(|length| base[..length].to_vec()).find(|path| all.contains_key(path));
+                let known =
+                    (1..=base.len()).rev().map(|length| base[..length].to_vec()).find(|path| all.contains_key(path));
                 found.extend(known.filter(|target| target != module));
             }
         }
@@ -157,7 +160,11 @@ fn no_file_imports_itself_through_others() {
 fn a_cycle_is_found() {
     let name = |text: &str| text.split("::").map(str::to_owned).collect::<Vec<_>>();
     let all: BTreeMap<_, _> = ["a", "b", "a::c"].map(|module| (name(module), PathBuf::new())).into();
-    let sources = [("a", "use crate::{b::{One, Two}, d::Three};"), ("b", "fn f() { crate::a::c::g() }"), ("a::c", "use super::Four;")];
+    let sources = [
+        ("a", "use crate::{b::{One, Two}, d::Three};"),
+        ("b", "fn f() { crate::a::c::g() }"),
+        ("a::c", "use super::Four;"),
+    ];
     let edges: BTreeMap<_, _> = sources.map(|(module, code)| (name(module), imports(&name(module), code, &all))).into();
     assert_eq!(edges[&name("b")], BTreeSet::from([name("a::c")]));
     assert_eq!(in_cycles(&edges), ["a", "a::c", "b"]);

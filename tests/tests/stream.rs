@@ -8,7 +8,7 @@ use std::time::{Duration, Instant};
 use flyrig_gpu::{AdapterChoice, GpuContext};
 use flyrig_stream::Posed;
 use flyrig_transport::{Interests, Subscriber, TransportConfig, Views};
-use flyrig_viewer::{Receiver, Scene, clock_secs};
+use flyrig_viewer::{PeopleScene, Receiver, clock_secs};
 use support::{PATIENCE, Process, small_rig, wait_until};
 
 const PROGRAM: &str = env!("CARGO_BIN_EXE_flyrig-under-test");
@@ -31,7 +31,7 @@ fn view(receiver: &Receiver, gpu: &GpuContext, camera: &flyrig_types::Camera) ->
     let motion = person.motion_at(clock_secs(), false).unwrap();
     let mut posed = Posed::default();
     let colors = person.pose(&motion, &mut posed);
-    let mut scene = Scene::new(&gpu.fastest()).unwrap();
+    let mut scene = PeopleScene::new(&gpu.fastest()).unwrap();
     scene.set_people([(&posed, colors.as_slice())]).unwrap();
     (motion.stamp.frame, scene.draw(camera).unwrap())
 }

@@ -21,8 +21,8 @@ use flyrig_report::{progress_bar, stop, write_whole};
 use flyrig_stream::{Posed, StreamTemplate, stamp_of};
 use flyrig_transport::{FetchedTemplate, Interests, Subscriber, TransportConfig};
 use flyrig_types::{Camera, Mask, RenderedView};
-use flyrig_viewer::{Scene, age_secs, clock_secs};
-use flyrig_viewing::{People, Taken};
+use flyrig_viewer::{PeopleScene, age_secs, clock_secs};
+use flyrig_viewing::{Ingested, People};
 use serde::Serialize;
 
 use crate::cli::BenchReceiveArgs;
@@ -92,7 +92,7 @@ struct Results {
 
 /// Draws what comes.
 fn draw(gpu: &GpuContext, jobs: Receiver<Job>) -> Result<Results> {
-    let mut scene = Scene::new(gpu)?;
+    let mut scene = PeopleScene::new(gpu)?;
     let mut results = Results::default();
     for Job { posed, colors, camera, wanted } in jobs {
         let mut draw = |colors: &Colors| -> Result<RenderedView> {
@@ -121,12 +121,12 @@ fn reference(take: &Path) -> Result<BTreeMap<u64, Colors>> {
             let person = u32::from_le_bytes(*person);
             if kind == TEMPLATE {
                 if round == 0 {
-                    people.meet(person, Arc::new(StreamTemplate::decode(bytes)?));
+                    people.set_template(person, Arc::new(StreamTemplate::decode(bytes)?));
                 }
                 continue;
             }
             let frame = stamp_of(bytes)?.frame;
-            people.take(person, kind == MOTION, bytes, 0.0)?;
+            people.ingest(person, kind == MOTION, bytes, 0.0)?;
             if let Some(person) = people.get_mut(person).filter(|_| round == 1 && frame % KEPT_EVERY == 0)
                 && let Some(motion) = person.motion_at(0.0, false)
             {
@@ -167,7 +167,7 @@ pub fn receive(args: &BenchReceiveArgs, gpu: &GpuContext) -> Result<()> {
         bar.set_position(start.elapsed().as_secs());
         if let Some(FetchedTemplate { people: of, bytes, .. }) = templates.take().unwrap_or_default() {
             let template = Arc::new(StreamTemplate::decode(&bytes)?);
-            of.into_iter().for_each(|person| people.meet(person, Arc::clone(&template)));
+            of.into_iter().for_each(|person| people.set_template(person, Arc::clone(&template)));
         }
         if let Some(stats) = subscriber.next_stats(Duration::ZERO)? {
             offset = stats.body.clock_offset_nanos;
@@ -182,8 +182,8 @@ pub fn receive(args: &BenchReceiveArgs, gpu: &GpuContext) -> Result<()> {
             let is_motion = message.layer.is_none();
             row.message_after_secs.get_or_insert(elapsed);
             ensure!(received.latency_is_exact, "both ends must be on one computer, whose clock ages are read from");
-            let taken = people.take(message.person, is_motion, &message.bytes, clock_secs());
-            if let Ok(Taken::Needs(hash)) = taken {
+            let taken = people.ingest(message.person, is_motion, &message.bytes, clock_secs());
+            if let Ok(Ingested::Needs(hash)) = taken {
                 templates.ask(message.person, hash);
             }
             if is_counted {
@@ -191,7 +191,7 @@ pub fn receive(args: &BenchReceiveArgs, gpu: &GpuContext) -> Result<()> {
                 motions += u64::from(is_motion);
                 colors += u64::from(!is_motion);
             }
-            if is_motion && matches!(taken, Ok(Taken::Applied)) {
+            if is_motion && matches!(taken, Ok(Ingested::Applied)) {
                 row.motion_after_secs.get_or_insert(elapsed);
                 if let Some(last) = last_motion.replace(now).filter(|_| is_counted) {
                     row.longest_gap_secs = row.longest_gap_secs.max((now - last).as_secs_f64());

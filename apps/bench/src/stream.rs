@@ -12,7 +12,7 @@ pub use take::Subject;
 use anyhow::{Context, Result};
 use flyrig_gpu::GpuContext;
 use flyrig_report::{progress_bar, stop, write_whole};
-use flyrig_viewer::Scene;
+use flyrig_viewer::PeopleScene;
 
 use crate::cli::BenchStreamArgs;
 use atlas::Atlas;
@@ -69,7 +69,7 @@ fn run(args: &BenchStreamArgs, gpu: &GpuContext, take: &Take, has_codec: bool) -
     for &crf in args.crf.iter().filter(|_| has_codec) {
         forms.push(Box::new(Atlas::new(crf, take)?));
     }
-    let mut scene = Scene::new(&gpu.fastest())?;
+    let mut scene = PeopleScene::new(&gpu.fastest())?;
     let bar = progress_bar((forms.len() * take.kept.len()) as u64, "bench stream");
     let mut rows = Vec::new();
     for form in &mut forms {

@@ -56,7 +56,7 @@ mod tests {
     use flyrig_renderer::HarmonicOrder;
     use flyrig_stream::{Motion, MotionEncoder, Posed, PosedAxes, StreamTemplate};
     use flyrig_types::{Camera, Intrinsics, Isometry, Lens};
-    use flyrig_viewer::{Scene, ShownPerson};
+    use flyrig_viewer::{PeopleScene, ShownPerson};
     use glam::{DQuat, DVec2, DVec3, Vec4};
 
     use super::*;
@@ -106,7 +106,7 @@ mod tests {
         template.pose(&motion, &mut posed);
         assert!(template.pose_axes(&motion, &mut axes));
 
-        let mut ours = Scene::new(&gpu).unwrap();
+        let mut ours = PeopleScene::new(&gpu).unwrap();
         let mut colors = Vec::new();
         assert!(template.avatar_colors(&posed, &mut colors));
         let colors = colors.as_slice();

@@ -6,6 +6,7 @@ use anyhow::{Context, Result};
 use base64::{Engine as _, prelude::BASE64_STANDARD};
 use flyrig_fusion::StageSummary;
 use flyrig_metrics::CameraScore;
+use flyrig_types::escape_html;
 
 use crate::plot::{Line, Plot, Series};
 
@@ -78,7 +79,7 @@ impl Report {
     #[must_use]
     pub fn html(&self) -> String {
         let mut page = String::new();
-        let title = escape(&self.title);
+        let title = escape_html(&self.title);
         let _ = write!(
             page,
             "<!doctype html><html lang=en><meta charset=utf-8><meta name=viewport content=\"width=device-width\"><title>{title}</title><style>{STYLE}</style><h1>{title}</h1>"
@@ -87,37 +88,38 @@ impl Report {
             let _ = write!(page, "<meta http-equiv=refresh content={secs}>");
         }
         for sentence in &self.sentences {
-            let _ = write!(page, "<p>{}", escape(sentence));
+            let _ = write!(page, "<p>{}", escape_html(sentence));
         }
         if !self.facts.is_empty() {
             page.push_str("<table>");
             for (name, value) in &self.facts {
-                let _ = write!(page, "<tr><td>{}<td style=\"text-align:left\">{}", escape(name), escape(value));
+                let _ =
+                    write!(page, "<tr><td>{}<td style=\"text-align:left\">{}", escape_html(name), escape_html(value));
             }
             page.push_str("</table>");
         }
         for Table { title, head, rows } in &self.tables {
             let cells = |mark: &str, row: &[String]| -> String {
-                row.iter().map(|cell| format!("<{mark}>{}", escape(cell))).collect()
+                row.iter().map(|cell| format!("<{mark}>{}", escape_html(cell))).collect()
             };
             let rows: String = rows.iter().map(|row| format!("<tr>{}", cells("td", row))).collect();
-            let _ = write!(page, "<h2>{}</h2><table><tr>{}{rows}</table>", escape(title), cells("th", head));
+            let _ = write!(page, "<h2>{}</h2><table><tr>{}{rows}</table>", escape_html(title), cells("th", head));
         }
         for (title, svg) in &self.drawings {
-            let _ = write!(page, "<h2>{}</h2>{svg}", escape(title));
+            let _ = write!(page, "<h2>{}</h2>{svg}", escape_html(title));
         }
         for (name, scores) in &self.scores {
             let _ = write!(
                 page,
                 "<h2>{}</h2><table><tr><th>camera<th>frames<th>PSNR dB<th>SSIM<th>FLIP<th>mask IoU",
-                escape(name)
+                escape_html(name)
             );
             for s in scores {
                 let iou = s.iou.map_or_else(|| "-".to_owned(), |v| format!("{v:.4}"));
                 let _ = write!(
                     page,
                     "<tr><td>{}<td>{}<td>{:.2}<td>{:.4}<td>{:.4}<td>{iou}",
-                    escape(&s.camera),
+                    escape_html(&s.camera),
                     s.frames,
                     s.psnr_db,
                     s.ssim,
@@ -130,10 +132,10 @@ impl Report {
             page.push_str("<h2>Images</h2>");
         }
         for row in &self.contact {
-            let _ = write!(page, "<figcaption>{}</figcaption><div class=row>", escape(&row.label));
+            let _ = write!(page, "<figcaption>{}</figcaption><div class=row>", escape_html(&row.label));
             for (caption, png) in &row.pictures {
                 let data = BASE64_STANDARD.encode(png);
-                let caption = escape(caption);
+                let caption = escape_html(caption);
                 let _ = write!(
                     page,
                     "<figure><img alt=\"{caption}\" src=\"data:image/png;base64,{data}\"><figcaption>{caption}</figcaption></figure>"
@@ -149,7 +151,7 @@ impl Report {
                 let _ = write!(
                     page,
                     "<tr><td>{}<td>{}<td>{:.2}<td>{:.2}<td>{:.2}<td>{:.2}",
-                    escape(&s.name),
+                    escape_html(&s.name),
                     s.frames,
                     s.mean_ms,
                     s.p50_ms,
@@ -160,7 +162,7 @@ impl Report {
             page.push_str("</table>");
         }
         for curve in &self.curves {
-            let _ = write!(page, "<h2>{}</h2>{}", escape(&curve.title), curve.svg());
+            let _ = write!(page, "<h2>{}</h2>{}", escape_html(&curve.title), curve.svg());
         }
         page.push_str("</html>\n");
         page
@@ -205,10 +207,6 @@ impl Curve {
         // Inside of a page the namespace goes without saying.
         plot.strip().replacen(" xmlns=\"http://www.w3.org/2000/svg\"", "", 1)
     }
-}
-
-fn escape(text: &str) -> String {
-    text.replace('&', "&amp;").replace('<', "&lt;").replace('>', "&gt;").replace('"', "&quot;")
 }
 
 #[cfg(test)]

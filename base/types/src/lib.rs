@@ -14,6 +14,7 @@
 mod camera;
 mod color_match;
 mod frame;
+mod html;
 mod ids;
 mod image;
 mod isometry;
@@ -29,6 +30,7 @@ mod whole_file;
 pub use camera::{Camera, CameraError, Intrinsics, Lens, MAX_IMAGE_SIDE, Rig};
 pub use color_match::ColorMatch;
 pub use frame::{Frame, FrameSet, SetKind};
+pub use html::escape_html;
 pub use ids::CameraId;
 pub use image::{Image, ImageError, Mask, PixelBuffer, PixelFormat, Recycle};
 pub use isometry::Isometry;

@@ -1,6 +1,6 @@
 //! The attributes of a Gaussian: the one place that names them for buffers, kernels, read-back and files.
 //!
-//! On the wire (`transport/transport/src/splats.rs`) a splat has `center_scale` and `color` in its own quantisation; `normal` and
+//! On the wire (`transport/stream/src/splats.rs`) a splat has `center_scale` and `color` in its own quantisation; `normal` and
 //! `canonical` stay on the device.
 
 use flyrig_gpu::{GpuContext, GpuError, StorageBuffer};

@@ -1,16 +1,16 @@
-//! The HTTP server of one page: the metrics, or the progress of a calibration.
+//! HTTP server of one page: the metrics, or the progress of a calibration.
 
 use std::{
     convert::Infallible,
-    net::{SocketAddr, TcpListener},
+    net::SocketAddr,
     sync::{Arc, Mutex},
-    thread::{Builder, JoinHandle},
     time::Duration,
 };
 
 use flyrig_types::lock;
 
 use anyhow::{Context as _, Result};
+use flyrig_access::{Bounds, Connection, Listener, Serve};
 use hyper::{
     Method, Request, Response, StatusCode,
     body::Incoming,
@@ -19,31 +19,36 @@ use hyper::{
     service::service_fn,
 };
 use hyper_util::rt::{TokioIo, TokioTimer};
-use tokio::{
-    net::TcpStream,
-    runtime,
-    sync::{Semaphore, oneshot},
-    time::{sleep, timeout},
-};
+use tokio::{net::TcpStream, time::timeout};
 
-/// Time that a client has to ask.
+/// Time limit of the headers of a request.
 const PATIENCE: Duration = Duration::from_secs(1);
-/// Time from the connection to the end of the answer.
+/// Time limit from the connection to the end of the answer.
 const LONGEST: Duration = Duration::from_secs(2);
-/// Longest request that is read, the smallest bound that hyper takes.
+/// Largest request, bytes; the smallest bound that hyper takes.
 const REQUEST_BYTES: usize = 8192;
-/// Clients that are served at the same time; the others wait in the system's queue.
+/// Largest number of clients at a time; further ones wait in the system's queue.
 const CONNECTIONS: usize = 32;
-/// Pause after a connection could not be accepted: with no file descriptor left, trying at once only costs time.
-const PAUSE: Duration = Duration::from_millis(100);
 
-/// Answers HTTP requests with the text published last, in one thread.
+/// Server that answers HTTP requests with the text published last, in one thread.
 pub struct PageServer {
-    text: Arc<Mutex<String>>,
-    address: SocketAddr,
-    /// Dropping it ends the thread.
-    stop: Option<oneshot::Sender<()>>,
-    thread: Option<JoinHandle<()>>,
+    page: Arc<Page>,
+    listener: Listener,
+}
+
+/// Text of the page.
+struct Page {
+    text: Mutex<String>,
+    /// Media type.
+    kind: &'static str,
+}
+
+impl Serve for Page {
+    async fn serve(self: Arc<Self>, connection: Connection) {
+        let Connection { stream, place: _place, .. } = connection;
+        // A malformed request, or a client that reads slowly, costs that client alone.
+        let _ = timeout(LONGEST, answer(stream, &self.text, self.kind)).await;
+    }
 }
 
 impl PageServer {
@@ -52,66 +57,25 @@ impl PageServer {
     /// # Errors
     /// Names the address when it is taken.
     pub fn start(option: &str, address: &str, kind: &'static str) -> Result<Self> {
-        let listener = TcpListener::bind(address).with_context(|| format!("{option}: cannot listen on {address}"))?;
-        listener.set_nonblocking(true)?;
-        let address = listener.local_addr()?;
-        let runtime = runtime::Builder::new_current_thread().enable_io().enable_time().build()?;
-        let text = Arc::new(Mutex::new(String::new()));
-        let (stop, stopped) = oneshot::channel();
-        let of_thread = Arc::clone(&text);
-        let work = move || {
-            // Open connections end with the runtime.
-            runtime.block_on(async {
-                tokio::select! {
-                    _ = stopped => {}
-                    ended = serve(listener, &of_thread, kind) => if let Err(error) = ended {
-                        tracing::error!("the page has ended: {error}");
-                    }
-                }
-            });
-        };
-        let thread = Builder::new().name("page".to_owned()).spawn(work)?;
-        Ok(Self { text, address, stop: Some(stop), thread: Some(thread) })
+        let bounds = Bounds { connections: CONNECTIONS, per_address: false, is_streaming: false };
+        let listener =
+            Listener::bind(address, bounds).with_context(|| format!("{option}: cannot listen on {address}"))?;
+        let page = Arc::new(Page { text: Mutex::default(), kind });
+        let listener = listener.start("page", Arc::clone(&page))?;
+        Ok(Self { page, listener })
     }
 
     /// Returns the address that is listened on.
     pub fn address(&self) -> SocketAddr {
-        self.address
+        self.listener.address()
     }
 
     /// Sets the text of all answers from now on.
     pub fn publish(&self, text: String) {
-        *lock(&self.text) = text;
+        *lock(&self.page.text) = text;
     }
 }
 
-impl Drop for PageServer {
-    fn drop(&mut self) {
-        drop(self.stop.take());
-        if let Some(thread) = self.thread.take() {
-            let _ = thread.join();
-        }
-    }
-}
-
-/// Accepts clients, no more than [`CONNECTIONS`] at a time, and answers each in a task.
-async fn serve(listener: TcpListener, text: &Arc<Mutex<String>>, kind: &'static str) -> std::io::Result<()> {
-    let listener = tokio::net::TcpListener::from_std(listener)?;
-    let places = Arc::new(Semaphore::new(CONNECTIONS));
-    while let Ok(place) = Arc::clone(&places).acquire_owned().await {
-        match listener.accept().await {
-            Ok((client, _)) => {
-                let text = Arc::clone(text);
-                tokio::spawn(async move {
-                    let _place = place;
-                    // A client that asks badly or reads slowly is its own loss.
-                    let _ = timeout(LONGEST, answer(client, &text, kind)).await;
-                });
-            }
-            Err(_) => sleep(PAUSE).await,
-        }
-    }
-    Ok(())
 }
 
 /// Answers one request.
@@ -142,6 +106,7 @@ mod tests {
     use std::{
         io::{ErrorKind, Read as _, Write as _},
         net::TcpStream,
+        thread::Builder,
     };
 
     use super::*;
@@ -177,7 +142,7 @@ mod tests {
     }
 
     #[test]
-    fn a_client_that_dawdles_holds_nobody_up() {
+    fn a_slow_client_delays_no_other() {
         let server = start("127.0.0.1:0").unwrap();
         server.publish("flyrig_frames_total 1\n".to_owned());
         let mut slow = TcpStream::connect(server.address()).unwrap();
@@ -203,7 +168,7 @@ mod tests {
         let connect = || TcpStream::connect(server.address()).unwrap();
         let silent: Vec<TcpStream> = (1..CONNECTIONS).map(|_| connect()).collect();
         // They are all being served.
-        std::thread::sleep(2 * PAUSE);
+        std::thread::sleep(Duration::from_millis(200));
         let answer = ask(&server, "GET /metrics HTTP/1.1\r\n\r\n");
         assert!(answer.ends_with("flyrig_frames_total 1\n"), "{answer}");
         for client in &silent {

@@ -1,4 +1,4 @@
-# attack_gate.py PORT SECONDS RATE: opens 1,000 connections to a gate of this computer and says nothing on them, then RATE new ones a second with noise,
+# attack_gate.py PORT SECONDS RATE: opens 1,000 connections to a gate of this computer and says nothing on them, then RATE new ones per second with noise,
 # all from 127.0.0.2. Measure beside it with `flyrig-bench receive`.
 import socket,sys,time
 port=int(sys.argv[1]);secs=float(sys.argv[2]);rate=float(sys.argv[3])
@@ -27,4 +27,4 @@ while time.time()-start<secs:
                 recent.pop(0).close()
         except OSError: pass
     time.sleep(0.001)
-print('connections a second',n/secs)
+print('connections per second',n/secs)

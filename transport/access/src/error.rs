@@ -2,34 +2,34 @@
 
 use std::{net::SocketAddr, path::PathBuf};
 
-/// Error of keys or of the gate; its text names the file, holder or address, and the fix.
+/// Error of keys or of the gate, whose text names the file, holder or address, and the fix.
 #[derive(Debug, thiserror::Error)]
 pub enum AccessError {
-    /// A file cannot be used.
+    /// Unusable file.
     #[error("{}: {problem}", file.display())]
     File {
-        /// Which one.
+        /// Path of the file.
         file: PathBuf,
-        /// The fault and the fix.
+        /// Fault and fix.
         problem: String,
     },
-    /// A request is not possible.
+    /// Impossible request.
     #[error("{0}")]
     Request(String),
-    /// The gate's address cannot be listened on.
+    /// Address of the gate that cannot be listened on.
     #[error(
         "cannot listen on {address}: {problem}; is another rig with keys running? Free the port, or change it in ring.toml"
     )]
     Listen {
-        /// The address.
+        /// Address of the gate.
         address: SocketAddr,
         /// Error of the operating system.
         problem: std::io::Error,
     },
-    /// The rig cannot be reached, or does not admit the key; for [`crate::Probe`].
+    /// Rig that cannot be reached or rejects the key.
     #[error("{0}")]
     Refused(String),
-    /// The system gives no thread or no random numbers, or a certificate cannot be made.
+    /// Failure of the system: no thread, no random numbers, or no certificate.
     #[error("keys: {0}")]
     System(String),
 }

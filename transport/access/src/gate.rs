@@ -1,12 +1,11 @@
-//! The gate: admits holders of keys, and passes their connections on.
+//! Gate: admits holders of keys, and passes their connections on.
 
 use std::{
     collections::HashMap,
     net::{IpAddr, Ipv4Addr, SocketAddr},
     path::PathBuf,
     sync::{Arc, Mutex},
-    thread::{Builder, JoinHandle},
-    time::{Duration, Instant, SystemTime, UNIX_EPOCH},
+    time::{Duration, SystemTime, UNIX_EPOCH},
 };
 
 use flyrig_types::lock;
@@ -14,9 +13,8 @@ use flyrig_types::lock;
 use rustls_pki_types::{CertificateDer, ServerName, UnixTime};
 use tokio::{
     io::{AsyncReadExt as _, AsyncWriteExt as _, copy_bidirectional_with_sizes},
-    net::{TcpListener, TcpSocket, TcpStream},
-    runtime,
-    sync::{oneshot, watch},
+    net::{TcpSocket, TcpStream},
+    sync::watch,
     time::{sleep, timeout},
 };
 use tokio_rustls::{
@@ -29,38 +27,36 @@ use tokio_rustls::{
 };
 
 use crate::{
-    AccessError, Holder, Ring, Role,
-    issue::{Authority, Pair, Side},
-    limits::Limits,
-    ring_folder::{fingerprint, list_time, read_holders},
+    error::AccessError,
+    holder::Holder,
+    issue::{Authority, CertificatePair, TlsSide},
+    listener::{Bounds, Connection, Listener, Serve},
+    ring_folder::{Ring, fingerprint, list_time, read_holders},
+    role::Role,
     tls,
 };
 
-/// Time in which a client must show its key.
+/// Time limit of a handshake, and of the client's first message.
 const PATIENCE: Duration = Duration::from_secs(5);
-/// How often the list of holders is looked at, and how long a key outlives its end.
-const LOOK_EVERY: Duration = Duration::from_millis(500);
-/// Connections of one key at a time.
+/// Interval between checks of the list of holders, and the longest time that a key outlives its end.
+const CHECK_EVERY: Duration = Duration::from_millis(500);
+/// Largest number of connections of one key at a time.
 const CONNECTIONS_OF_ONE: usize = 16;
-/// Connections at a time.
+/// Largest number of admitted connections at a time.
 const CONNECTIONS: usize = 512;
-/// Pause after a connection could not be accepted.
-const PAUSE: Duration = Duration::from_millis(100);
-/// Bytes of a copy from one side to the other.
+/// Largest number of connections and handshakes at a time: more than [`CONNECTIONS`] and the handshakes of all addresses together.
+const ACCEPTED: usize = 1024;
+/// Bytes copied at once from one side to the other.
 const COPY_BYTES: usize = 4 << 10;
-/// Bytes that the system keeps for a viewer, sent or not: enough for 20 Mbit/s with 200 ms. Linux doubles it.
-const SEND_BUFFER: u32 = 256 << 10;
-/// Bytes of them that are not sent yet: what lies there cannot be overtaken by newer motion.
-const UNSENT: u32 = 4 << 10;
 /// Bytes that the system keeps between the session and the gate.
 const INNER_BUFFER: u32 = 16 << 10;
-/// Years that certificates between gate and session are valid; they live as long as the program.
+/// Validity of the certificates between gate and session, seconds; they live as long as the program.
 const INNER_SECS: u64 = 20 * 365 * 86_400;
 
-/// Certificates between a gate and the session behind it: made anew for each gate, and known to nobody else.
+/// Certificates between a gate and the session behind it, made for each gate and known to nobody else.
 pub struct Inner {
     authority: Authority,
-    own: Pair,
+    own: CertificatePair,
 }
 
 impl std::fmt::Debug for Inner {
@@ -70,18 +66,18 @@ impl std::fmt::Debug for Inner {
 }
 
 impl Inner {
-    /// Makes new certificates.
+    /// Issues new certificates.
     ///
     /// # Errors
-    /// [`AccessError::System`].
+    /// [`AccessError::System`] without random numbers.
     pub fn new() -> Result<Self, AccessError> {
         let authority = Authority::new("flyrig gate", (now_secs(), now_secs() + INNER_SECS))?.0;
         let hosts = [Ipv4Addr::LOCALHOST.to_string()];
-        let own = authority.sign("flyrig session", &hosts, Side::Server, (now_secs(), now_secs() + INNER_SECS))?;
+        let own = authority.sign("flyrig session", &hosts, TlsSide::Server, (now_secs(), now_secs() + INNER_SECS))?;
         Ok(Self { authority, own })
     }
 
-    /// Returns the authority whose clients the session must require, PEM.
+    /// Returns the authority that must have signed the certificates of the session's clients, PEM.
     #[must_use]
     pub fn authority(&self) -> &str {
         &self.authority.certificate
@@ -93,20 +89,17 @@ impl Inner {
         (&self.own.certificate, &self.own.key)
     }
 
-    /// Returns the common name of a holder's certificate towards the session.
+    /// Returns the common name of a holder's certificate towards the session, made of role and number.
     #[must_use]
     pub fn name(role: Role, number: usize) -> String {
         format!("{}-{number}", role.name())
     }
 }
 
-/// Admits holders until it is dropped.
+/// Gate that admits holders until it is dropped.
 #[derive(Debug)]
 pub struct Gate {
-    address: SocketAddr,
-    /// Dropping it ends the thread.
-    stop: Option<oneshot::Sender<()>>,
-    thread: Option<JoinHandle<()>>,
+    listener: Listener,
 }
 
 impl Gate {
@@ -133,50 +126,24 @@ impl Gate {
         let verifier = Arc::new(Admission { chain, list: Arc::clone(&list) });
         let own = ring.own();
         let server = tls::server(verifier, &own.certificate, &own.key).map_err(damaged)?;
-        let runtime = runtime::Builder::new_current_thread().enable_io().enable_time().build();
-        let runtime = runtime.map_err(AccessError::system)?;
-        let listener = {
-            let _inside = runtime.enter();
-            listen(address).map_err(|problem| AccessError::Listen { address, problem })?
-        };
-        let address = listener.local_addr().map_err(AccessError::system)?;
+        let bounds = Bounds { connections: ACCEPTED, per_address: true, is_streaming: true };
+        let listener = Listener::bind(address, bounds).map_err(|problem| AccessError::Listen { address, problem })?;
         let shared = Arc::new(Shared {
             acceptor: TlsAcceptor::from(Arc::new(server)),
             list,
             inner,
             session,
-            limits: Mutex::default(),
             connections: Mutex::default(),
             refusals: Mutex::default(),
         });
-        let (stop, stopped) = oneshot::channel::<()>();
-        let work = move || {
-            runtime.block_on(async {
-                tokio::select! {
-                    () = accept(&listener, &shared) => {}
-                    () = follow(&shared.list) => {}
-                    _ = stopped => {}
-                }
-            });
-            runtime.shutdown_timeout(PAUSE);
-        };
-        let thread = Builder::new().name("gate".to_owned()).spawn(work).map_err(AccessError::system)?;
-        Ok(Self { address, stop: Some(stop), thread: Some(thread) })
+        let listener = listener.start("gate", shared).map_err(AccessError::system)?;
+        Ok(Self { listener })
     }
 
     /// Returns the address that is listened on.
     #[must_use]
     pub fn address(&self) -> SocketAddr {
-        self.address
-    }
-}
-
-impl Drop for Gate {
-    fn drop(&mut self) {
-        drop(self.stop.take());
-        if let Some(thread) = self.thread.take() {
-            let _ = thread.join();
-        }
+        self.listener.address()
     }
 }
 
@@ -184,14 +151,14 @@ fn now_secs() -> u64 {
     SystemTime::now().duration_since(UNIX_EPOCH).map_or(0, |since| since.as_secs())
 }
 
-/// The list of holders as it was read last.
+/// List of holders as read last.
 #[derive(Debug)]
 struct List {
     folder: PathBuf,
     roles: Vec<Role>,
     read_at: Mutex<Option<SystemTime>>,
     holders: Mutex<Vec<Holder>>,
-    /// Counts changes.
+    /// Number of changes.
     changes: watch::Sender<u64>,
 }
 
@@ -199,15 +166,15 @@ impl List {
     fn find(&self, certificate: &CertificateDer<'_>) -> Option<Holder> {
         let print = fingerprint(certificate);
         let find = || lock(&self.holders).iter().find(|of| of.fingerprint == print).cloned();
-        // Of those that the authority has signed, one that is not known was added just now.
+        // The authority has signed it: an unknown holder was added just now.
         find().or_else(|| {
-            self.look();
+            self.reload();
             find()
         })
     }
 
     /// Reads the list again if it has changed.
-    fn look(&self) {
+    fn reload(&self) {
         let now = list_time(&self.folder);
         if now.is_none() || std::mem::replace(&mut *lock(&self.read_at), now) == now {
             return;
@@ -217,11 +184,11 @@ impl List {
                 *lock(&self.holders) = holders;
                 self.changes.send_modify(|count| *count += 1);
             }
-            Err(error) => tracing::warn!("the keys stay as they were: {error}"),
+            Err(error) => tracing::warn!("keys: the list cannot be read and stays as it was: {error}"),
         }
     }
 
-    /// Reason why a certificate is not admitted, for TLS.
+    /// Returns why a certificate is not admitted, for TLS; `None` when it is.
     fn refusal(&self, certificate: &CertificateDer<'_>) -> Option<CertificateError> {
         match self.find(certificate) {
             None => Some(CertificateError::Revoked),
@@ -234,15 +201,15 @@ impl List {
     }
 }
 
-/// Looks at the list again and again.
+/// Reloads the list periodically.
 async fn follow(list: &List) {
     loop {
-        sleep(LOOK_EVERY).await;
-        list.look();
+        sleep(CHECK_EVERY).await;
+        list.reload();
     }
 }
 
-/// Asks the authority, then the list.
+/// Verifier that checks the authority, then the list.
 #[derive(Debug)]
 struct Admission {
     chain: Arc<dyn ClientCertVerifier>,
@@ -293,16 +260,15 @@ struct Shared {
     list: Arc<List>,
     inner: Inner,
     session: SocketAddr,
-    limits: Mutex<Limits>,
-    /// By fingerprint.
+    /// Number of connections of each fingerprint.
     connections: Mutex<HashMap<String, usize>>,
-    /// By their words.
+    /// Number of refusals for each reason.
     refusals: Mutex<HashMap<&'static str, u64>>,
 }
 
 impl Shared {
-    /// Reports a refusal the 1st, 2nd, 4th time of its kind, whoever it was.
-    fn refuse(&self, who: &str, why: &'static str) {
+    /// Logs the 1st, 2nd, 4th refusal for a reason, and so on.
+    fn report_refusal(&self, who: &str, why: &'static str) {
         let mut refusals = lock(&self.refusals);
         let count = refusals.entry(why).or_default();
         *count += 1;
@@ -311,8 +277,8 @@ impl Shared {
         }
     }
 
-    /// Takes one of a key's connections; None when it has enough.
-    fn connect(self: &Arc<Self>, fingerprint: &str) -> Option<Place> {
+    /// Takes one of a key's connections; `None` when all are taken.
+    fn connect(self: &Arc<Self>, fingerprint: &str) -> Option<KeyPlace> {
         let mut connections = lock(&self.connections);
         let all: usize = connections.values().sum();
         let own = connections.entry(fingerprint.to_owned()).or_default();
@@ -320,17 +286,17 @@ impl Shared {
             return None;
         }
         *own += 1;
-        Some(Place { shared: Arc::clone(self), fingerprint: fingerprint.to_owned() })
+        Some(KeyPlace { shared: Arc::clone(self), fingerprint: fingerprint.to_owned() })
     }
 }
 
-/// One connection of a key.
-struct Place {
+/// Place among the connections of a key, given back when it is dropped.
+struct KeyPlace {
     shared: Arc<Shared>,
     fingerprint: String,
 }
 
-impl Drop for Place {
+impl Drop for KeyPlace {
     fn drop(&mut self) {
         let mut connections = lock(&self.shared.connections);
         if let Some(count) = connections.get_mut(&self.fingerprint) {
@@ -342,56 +308,43 @@ impl Drop for Place {
     }
 }
 
-/// Must be called inside of the runtime.
-fn listen(address: SocketAddr) -> std::io::Result<TcpListener> {
-    let socket = if address.is_ipv4() { TcpSocket::new_v4() } else { TcpSocket::new_v6() }?;
-    socket.set_reuseaddr(cfg!(unix))?;
-    // Connections inherit it.
-    socket.set_send_buffer_size(SEND_BUFFER)?;
-    socket.bind(address)?;
-    socket.listen(1024)
-}
+impl Serve for Shared {
+    async fn serve(self: Arc<Self>, connection: Connection) {
+        greet(connection, self).await;
+    }
 
-async fn accept(listener: &TcpListener, shared: &Arc<Shared>) {
-    loop {
-        match listener.accept().await {
-            Ok((client, address)) => {
-                if !lock(&shared.limits).begin(address.ip(), Instant::now()) {
-                    shared.refuse(&address.ip().to_string(), "too many connections without a key");
-                    continue;
-                }
-                tokio::spawn(greet(client, address, Arc::clone(shared)));
-            }
-            // With no file descriptor left, trying at once only costs time.
-            Err(_) => sleep(PAUSE).await,
-        }
+    fn refuse(&self, address: IpAddr) {
+        self.report_refusal(&address.to_string(), "too many connections without a key");
+    }
+
+    async fn beside(&self) {
+        follow(&self.list).await;
     }
 }
 
-async fn greet(client: TcpStream, address: SocketAddr, shared: Arc<Shared>) {
-    let _ = client.set_nodelay(true);
-    #[cfg(target_os = "linux")]
-    let _ = socket2::SockRef::from(&client).set_tcp_notsent_lowat(UNSENT);
-    let shaken = timeout(PATIENCE, shared.acceptor.accept(client)).await;
-    lock(&shared.limits).end(address.ip());
-    let who = address.ip().to_string();
+/// Admits a client and passes its connection on until it ends or is refused.
+async fn greet(connection: Connection, shared: Arc<Shared>) {
+    let Connection { stream, address, mut place } = connection;
+    let shaken = timeout(PATIENCE, shared.acceptor.accept(stream)).await;
+    place.established();
+    let who = address.to_string();
     let mut client = match shaken {
         Ok(Ok(client)) => client,
-        Ok(Err(error)) => return shared.refuse(&who, words(&error)),
-        Err(_) => return shared.refuse(&who, "it showed no key in time"),
+        Ok(Err(error)) => return shared.report_refusal(&who, describe_failure(&error)),
+        Err(_) => return shared.report_refusal(&who, "it showed no key in time"),
     };
     // Newer motion cannot overtake encrypted bytes either.
     client.get_mut().1.set_buffer_limit(Some(COPY_BYTES));
     let certificate = client.get_ref().1.peer_certificates().and_then(<[_]>::first).map(|of| of.clone().into_owned());
     let Some((certificate, holder)) = certificate.and_then(|of| shared.list.find(&of).map(|holder| (of, holder)))
     else {
-        return shared.refuse(&who, "its key was revoked");
+        return shared.report_refusal(&who, "its key was revoked");
     };
-    let who = format!("'{}' at {}", holder.name, address.ip());
-    let Some(_place) = shared.connect(&holder.fingerprint) else {
-        return shared.refuse(&who, "all connections of its key, or of the gate, are taken");
+    let who = format!("'{}' at {address}", holder.name);
+    let Some(_of_key) = shared.connect(&holder.fingerprint) else {
+        return shared.report_refusal(&who, "all connections of its key, or of the gate, are taken");
     };
-    // Whoever only wants to know whether its key is admitted says nothing.
+    // A client that only tries its key sends nothing.
     let mut first = [0; COPY_BYTES];
     let count = match timeout(PATIENCE, client.read(&mut first)).await {
         Ok(Ok(count)) if count > 0 => count,
@@ -412,18 +365,18 @@ async fn greet(client: TcpStream, address: SocketAddr, shared: Arc<Shared>) {
     }
 }
 
-/// Returns why the holder of an open connection is not admitted any more, once it is not.
+/// Waits until the holder of an open connection is no longer admitted, and returns the reason.
 async fn until_refused(certificate: &CertificateDer<'_>, holder: &Holder, list: &List) -> &'static str {
     let mut changes = list.changes.subscribe();
     loop {
         if list.refusal(certificate).is_some() {
             return "its key was revoked";
         }
-        // By the wall clock: it may be set.
+        // The wall clock may be set.
         if SystemTime::now() >= holder.expires_at() {
             return "its key has expired";
         }
-        let _ = timeout(LOOK_EVERY, changes.changed()).await;
+        let _ = timeout(CHECK_EVERY, changes.changed()).await;
     }
 }
 
@@ -434,7 +387,7 @@ async fn pass_on(holder: &Holder, shared: &Shared) -> std::io::Result<tokio_rust
     let pair = shared
         .inner
         .authority
-        .sign(&name, &[], Side::Client, (now_secs(), now_secs() + INNER_SECS))
+        .sign(&name, &[], TlsSide::Client, (now_secs(), now_secs() + INNER_SECS))
         .map_err(|error| failed(error.to_string()))?;
     let config = tls::client(shared.inner.authority(), &pair.certificate, &pair.key).map_err(failed)?;
     let socket = TcpSocket::new_v4()?;
@@ -446,7 +399,7 @@ async fn pass_on(holder: &Holder, shared: &Shared) -> std::io::Result<tokio_rust
 }
 
 /// Describes a failed handshake.
-fn words(error: &std::io::Error) -> &'static str {
+fn describe_failure(error: &std::io::Error) -> &'static str {
     let tls = error.get_ref().and_then(|inner| inner.downcast_ref::<TlsError>());
     match tls {
         Some(TlsError::NoCertificatesPresented) => "it has no key",

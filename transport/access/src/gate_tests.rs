@@ -1,9 +1,10 @@
-//! A gate before a session that sends back what it gets.
+//! Tests of a gate in front of a session that echoes.
 
 use std::{
     io::{Read as _, Write as _},
     net::{SocketAddr, TcpListener, TcpStream},
     sync::Arc,
+    thread::Builder,
     time::{Duration, Instant},
 };
 
@@ -19,7 +20,7 @@ struct Place {
     gate: Gate,
 }
 
-/// A session that greets with the common name that it was shown, then sends back what it gets.
+/// Starts a session that echoes what it receives, behind a letter for the common name that it was shown.
 fn session(inner: &Inner) -> SocketAddr {
     let (certificate, key) = inner.certificate_and_key();
     let config = tls::server(tls::client_verifier(inner.authority()).unwrap(), certificate, key).unwrap();
@@ -66,7 +67,7 @@ impl Place {
         self.here(key)
     }
 
-    /// A key that ends at a time, in seconds since 1970.
+    /// Issues a key that ends at a time, in seconds since 1970.
     fn add_until(&mut self, name: &str, end: u64) -> KeyFile {
         self.add(name);
         let key = self.ring.replace_validity(name, end);
@@ -118,7 +119,7 @@ fn a_list_that_cannot_be_read_changes_nothing() {
     let mut stream = connect(&key);
     echo(&mut stream, b"hello");
     std::fs::write(place.ring.folder().join("ring.toml"), "half a li").unwrap();
-    std::thread::sleep(2 * LOOK_EVERY);
+    std::thread::sleep(2 * CHECK_EVERY);
     assert_eq!(echo(&mut stream, b"again"), b"vagain");
     key.knock().unwrap();
 }

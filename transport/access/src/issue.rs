@@ -1,4 +1,4 @@
-//! Making certificates.
+//! Issuing of certificates.
 
 use std::time::Duration;
 
@@ -7,21 +7,21 @@ use rcgen::{
     date_time_ymd,
 };
 
-use crate::AccessError;
+use crate::error::AccessError;
 
-/// Seconds that a certificate is valid before it was made: clocks of computers differ.
+/// Seconds before its issue from which a certificate is valid: clocks of computers differ.
 const EARLY_SECS: u64 = 86_400;
 
 /// Certificate and private key, PEM.
 #[derive(Debug, Clone, PartialEq, Eq)]
-pub(crate) struct Pair {
+pub(crate) struct CertificatePair {
     pub certificate: String,
     pub key: String,
 }
 
-/// Side of a connection that a certificate is for.
+/// TlsSide of a connection that a certificate is for.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub(crate) enum Side {
+pub(crate) enum TlsSide {
     Server,
     Client,
 }
@@ -29,7 +29,7 @@ pub(crate) enum Side {
 /// Authority that signs certificates.
 pub(crate) struct Authority {
     issuer: Issuer<'static, KeyPair>,
-    /// PEM.
+    /// Certificate of the authority, PEM.
     pub certificate: String,
 }
 
@@ -50,7 +50,7 @@ fn authority_parameters(name: &str, valid_secs: (u64, u64)) -> Result<Certificat
 }
 
 impl Authority {
-    /// Makes a new one; also returns its private key, PEM.
+    /// Creates an authority; also returns its private key, PEM. Validity is in seconds since 1970.
     pub fn new(name: &str, valid_secs: (u64, u64)) -> Result<(Self, String), AccessError> {
         let key = KeyPair::generate().map_err(AccessError::system)?;
         let parameters = authority_parameters(name, valid_secs)?;
@@ -59,25 +59,31 @@ impl Authority {
         Ok((Self { issuer: Issuer::new(parameters, key), certificate }, secret))
     }
 
-    /// Takes up one that was made with the same name.
-    pub fn resume(name: &str, pair: Pair) -> Result<Self, AccessError> {
+    /// Restores an authority that was created with this name.
+    pub fn resume(name: &str, pair: CertificatePair) -> Result<Self, AccessError> {
         let key = KeyPair::from_pem(&pair.key).map_err(AccessError::system)?;
         // Only its name and key identifier go into what it signs.
         Ok(Self { issuer: Issuer::new(authority_parameters(name, (0, 0))?, key), certificate: pair.certificate })
     }
 
-    /// Signs a new certificate, valid until a time in seconds since 1970.
-    pub fn sign(&self, name: &str, hosts: &[String], side: Side, valid_secs: (u64, u64)) -> Result<Pair, AccessError> {
+    /// Signs a new certificate; validity is in seconds since 1970.
+    pub fn sign(
+        &self,
+        name: &str,
+        hosts: &[String],
+        side: TlsSide,
+        valid_secs: (u64, u64),
+    ) -> Result<CertificatePair, AccessError> {
         let key = KeyPair::generate().map_err(AccessError::system)?;
         let mut parameters = parameters(name, hosts, valid_secs)?;
         parameters.use_authority_key_identifier_extension = true;
         parameters.key_usages = vec![KeyUsagePurpose::DigitalSignature];
         // A holder's certificate must not pass for the rig's.
         parameters.extended_key_usages = vec![match side {
-            Side::Server => ExtendedKeyUsagePurpose::ServerAuth,
-            Side::Client => ExtendedKeyUsagePurpose::ClientAuth,
+            TlsSide::Server => ExtendedKeyUsagePurpose::ServerAuth,
+            TlsSide::Client => ExtendedKeyUsagePurpose::ClientAuth,
         }];
         let certificate = parameters.signed_by(&key, &self.issuer).map_err(AccessError::system)?;
-        Ok(Pair { certificate: certificate.pem(), key: key.serialize_pem() })
+        Ok(CertificatePair { certificate: certificate.pem(), key: key.serialize_pem() })
     }
 }

@@ -1,17 +1,17 @@
-//! The one file of a key's holder.
+//! Key file of a holder.
 
 use std::path::Path;
 
 use serde::{Deserialize, Serialize};
 
-use crate::{AccessError, Role, ring_folder::write_secret};
+use crate::{error::AccessError, holder::Holder, issue::CertificatePair, role::Role, secret_file::write_secret, tls};
 
 /// Largest key file that is read, bytes.
 const MAX_KEY_FILE_BYTES: u64 = 64 << 10;
 /// Version of the format.
 const VERSION: u32 = 1;
 
-/// Key of one holder: its name and role, the rig's addresses, certificate and private key.
+/// Key of one holder: name and role, addresses of the rig, certificate and private key.
 #[derive(Clone, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct KeyFile {
@@ -21,26 +21,26 @@ pub struct KeyFile {
     pub rig: String,
     /// Name of the holder.
     pub holder: String,
-    /// Role: the rights of the holder.
+    /// Role of the holder.
     pub role: Role,
     /// Name in topics: the ring's identifier and the holder's number.
     pub topic_name: String,
     /// Addresses of the rig, `HOST:PORT`.
     pub connect: Vec<String>,
-    /// Time after which it is refused, RFC 3339.
+    /// Time after which the key is refused, RFC 3339.
     pub expires: String,
-    /// Name in the rig's certificate, which nobody else's may have.
+    /// Name in the rig's certificate, which is unique to the rig.
     pub rig_certificate_name: String,
     /// Authority that signed the rig's certificate, PEM.
     pub authority: String,
-    /// The holder's certificate, PEM.
+    /// Certificate of the holder, PEM.
     pub certificate: String,
-    /// Its private key, PEM.
+    /// Private key of the holder, PEM.
     pub private_key: String,
 }
 
-/// Without the secret.
 impl std::fmt::Debug for KeyFile {
+    /// Formats the key without its secret.
     fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
         f.debug_struct("KeyFile")
             .field("rig", &self.rig)
@@ -54,12 +54,12 @@ impl std::fmt::Debug for KeyFile {
 impl KeyFile {
     pub(crate) fn new(
         rig: &str,
-        holder: &crate::Holder,
+        holder: &Holder,
         topic_name: String,
         connect: Vec<String>,
         rig_certificate_name: String,
         authority: String,
-        pair: crate::issue::Pair,
+        pair: CertificatePair,
     ) -> Self {
         Self {
             version: VERSION,
@@ -76,10 +76,10 @@ impl KeyFile {
         }
     }
 
-    /// Reads a file whose holder has one of these roles.
+    /// Reads a key file whose holder has one of these roles.
     ///
     /// # Errors
-    /// [`AccessError::File`] when it cannot be read, is no key, is one of a newer flyrig, or of another role.
+    /// [`AccessError::File`] when the file cannot be read or is no key, or the key is of a newer flyrig or of another role.
     pub fn read(path: &Path, roles: &[Role]) -> Result<Self, AccessError> {
         let key = Self::read_any(path)?;
         if roles.contains(&key.role) {
@@ -116,7 +116,7 @@ impl KeyFile {
         Ok(key)
     }
 
-    /// Checks what later parts rely on.
+    /// Checks the fields that other modules rely on.
     fn check(&self) -> Result<(), String> {
         let is_name = |text: &str| {
             !text.is_empty()
@@ -129,13 +129,13 @@ impl KeyFile {
         if self.rig_certificate_name.is_empty() {
             return Err("rig_certificate_name".to_owned());
         }
-        crate::tls::client(&self.authority, &self.certificate, &self.private_key).map(|_| ())
+        tls::client(&self.authority, &self.certificate, &self.private_key).map(|_| ())
     }
 
-    /// Writes a file that its owner alone may read.
+    /// Writes a file that only its owner may read.
     ///
     /// # Errors
-    /// [`AccessError::File`]; also when the file is there already.
+    /// [`AccessError::File`], also when the file exists already.
     pub fn write_new(&self, path: &Path) -> Result<(), AccessError> {
         let body = toml::to_string(self).map_err(AccessError::system)?;
         let text = format!(

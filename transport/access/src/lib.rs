@@ -1,24 +1,45 @@
-//! Access of other computers to a rig: keys of those who may connect, and the gate that admits them.
+//! Access of other computers to a rig: keys, and the gate that admits their holders.
 //!
 //! A [`Ring`] is the folder of a rig's keys: an authority that signs certificates, the rig's own certificate, and the list of holders.
-//! A [`KeyFile`] is what one holder gets: certificate, private key, and where the rig is. A [`Gate`] listens for holders, requires a
-//! certificate of the ring from each (TLS 1.3 on both sides), looks every one up in the list, and passes the connection on to a session
-//! of this computer under a name by which that session knows what the holder may do. The list is read again while the gate is open: a
-//! key that is revoked is disconnected at once.
+//! A [`KeyFile`] is the file of one holder: certificate, private key, and addresses of the rig. A [`Gate`] listens for holders, requires a
+//! certificate of the ring from each (TLS 1.3 on both sides), and looks it up in the list at every handshake, so that keys added or revoked
+//! take effect at once; a key that is revoked is disconnected. The gate bounds what one address may begin, and passes the connection on,
+//! through TLS again, to a session of the same process under a name made of role and number ([`Inner::name`]), which selects the holder's
+//! rights there. A [`KeyProbe`] finds out why a connection fails, which zenoh does not report.
+//!
+//! [`Listener`] is the bounded TCP listener below the gate; the servers of the web page and of the metrics use it as well.
+//!
+//! ```
+//! use flyrig_access::{KeyFile, Ring, Role};
+//!
+//! # let folder = tempfile::tempdir()?;
+//! # let (keys, file) = (folder.path().join("studio-keys"), folder.path().join("desk.key"));
+//! let mut ring = Ring::create(&keys, "studio", &["rig.local".to_owned()], 7450)?;
+//! let key = ring.add("desk", Role::Viewer, 30)?;
+//! key.write_new(&file)?;
+//! assert_eq!(KeyFile::read(&file, &[Role::Viewer])?.connect, ["rig.local:7450"]);
+//! ring.revoke("desk")?;
+//! # Ok::<(), Box<dyn std::error::Error>>(())
+//! ```
 
 mod error;
 mod gate;
+mod holder;
 mod issue;
 mod key_file;
 mod limits;
+mod listener;
 mod probe;
 mod ring_folder;
 mod role;
+mod secret_file;
 mod tls;
 
 pub use error::AccessError;
 pub use gate::{Gate, Inner};
+pub use holder::{Holder, MAX_HOLDERS};
 pub use key_file::KeyFile;
-pub use probe::Probe;
-pub use ring_folder::{DEFAULT_PORT, Holder, MAX_HOLDERS, Ring};
+pub use listener::{BoundListener, Bounds, Connection, ConnectionPlace, Listener, Serve};
+pub use probe::KeyProbe;
+pub use ring_folder::{DEFAULT_PORT, Ring};
 pub use role::Role;

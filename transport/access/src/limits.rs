@@ -1,4 +1,4 @@
-//! Bounds on connections of those who have not shown a key yet.
+//! Bounds, per address, on connections that are not established yet.
 
 use std::{
     collections::HashMap,
@@ -6,7 +6,7 @@ use std::{
     time::{Duration, Instant},
 };
 
-/// Connections a second that one address may begin, in the long run.
+/// Connections per second that one address may begin on average.
 const PER_SECOND: f64 = 20.0;
 /// Connections that one address may begin at once.
 const BURST: f64 = 40.0;
@@ -14,13 +14,15 @@ const BURST: f64 = 40.0;
 const PENDING_OF_ONE: usize = 16;
 /// Handshakes at a time.
 const PENDING: usize = 256;
-/// Addresses that are remembered.
+/// Largest number of addresses that are remembered.
 const ADDRESSES: usize = 4096;
-/// Bits of an IPv6 address that one network is given.
+/// Mask of the bits that identify an IPv6 network.
 const V6_NETWORK: u128 = !0 << 64;
 
+/// Counts of one network.
 #[derive(Debug)]
 struct Visitor {
+    /// Connections that may begin at `at`.
     left: f64,
     at: Instant,
     pending: usize,
@@ -44,10 +46,10 @@ fn network(address: IpAddr) -> IpAddr {
 }
 
 impl Limits {
-    /// Whether an address may begin a handshake now; [`Self::end`] must follow then.
+    /// Begins a handshake of an address; returns false when the address must wait. Otherwise [`Self::end`] must follow.
     pub fn begin(&mut self, address: IpAddr, now: Instant) -> bool {
         if self.visitors.len() >= ADDRESSES {
-            // Whoever has been away for so long has everything again.
+            // After this time a visitor has its whole burst again.
             let full = Duration::from_secs_f64(BURST / PER_SECOND);
             self.visitors.retain(|_, visitor| visitor.pending > 0 || now.duration_since(visitor.at) < full);
         }
@@ -82,12 +84,12 @@ mod tests {
     use super::*;
 
     #[test]
-    fn one_address_does_not_use_up_the_places_of_others() {
+    fn one_address_does_not_use_up_the_room_of_others() {
         let (mut limits, now) = (Limits::default(), Instant::now());
         let (noisy, calm) = (IpAddr::from([10, 0, 0, 1]), IpAddr::from([10, 0, 0, 2]));
         assert_eq!((0..1000).filter(|_| limits.begin(noisy, now)).count(), PENDING_OF_ONE);
         assert!(limits.begin(calm, now));
-        // Handshakes that end make place, until the burst is used up.
+        // Handshakes that end make room, until the burst is used up.
         (0..PENDING_OF_ONE).for_each(|_| limits.end(noisy));
         let mut begun = PENDING_OF_ONE;
         while limits.begin(noisy, now) {
@@ -95,7 +97,7 @@ mod tests {
             begun += 1;
         }
         assert_eq!(begun, BURST as usize);
-        // Then so many a second.
+        // Then the rate per second applies.
         let later = |tenths: u64| now + Duration::from_millis(100 * tenths);
         let slow = (1..=100).filter(|tenth| (0..50).any(|_| limits.begin(noisy, later(*tenth)))).count();
         assert!(slow >= 14, "{slow}");

@@ -1,4 +1,4 @@
-//! Finds out why a rig does not admit a key.
+//! Diagnosis why a rig rejects a key.
 
 use std::{
     io::{ErrorKind, Read as _, Write as _},
@@ -16,20 +16,20 @@ use flyrig_types::lock;
 use rustls_pki_types::ServerName;
 use tokio_rustls::rustls::{AlertDescription, CertificateError, ClientConnection, Error as TlsError, Stream};
 
-use crate::{AccessError, KeyFile, Role, tls};
+use crate::{error::AccessError, key_file::KeyFile, role::Role, tls};
 
-/// Time for an answer of the rig.
+/// Time limit of an answer of the rig.
 const PATIENCE: Duration = Duration::from_secs(3);
-/// A refusal comes within this after the handshake; silence admits.
+/// Time after the handshake within which a refusal arrives; silence admits.
 const SILENCE: Duration = Duration::from_millis(1000);
-/// Pause between two attempts.
+/// Interval between two attempts.
 const EVERY: Duration = Duration::from_secs(2);
 
 impl KeyFile {
-    /// Knocks at the rig: connects to its addresses in turn, shows the key, and hangs up.
+    /// Tries the key: connects to the rig's addresses in turn, shows the key, and disconnects.
     ///
     /// # Errors
-    /// [`AccessError::Refused`] with the reason of the last address, when none admits the key.
+    /// [`AccessError::Refused`] with the reason at the last address, when none admits the key.
     pub fn knock(&self) -> Result<(), AccessError> {
         let mut why = "the key names no address".to_owned();
         for address in &self.connect {
@@ -41,7 +41,7 @@ impl KeyFile {
         Err(AccessError::Refused(why))
     }
 
-    /// Returns the first address where the rig admits the key, or the first of all. Asks only where there are several.
+    /// Returns the first address where the rig admits the key, otherwise the first of all. Connects only where there are several.
     #[must_use]
     pub fn address(&self) -> &str {
         let all = self.connect.as_slice();
@@ -73,7 +73,7 @@ impl KeyFile {
             }
         }
         let Some(mut stream) = stream else { return Err(problem) };
-        let of = |error: std::io::Error| self.words(address, &error);
+        let of = |error: std::io::Error| self.explain(address, &error);
         stream.set_read_timeout(Some(PATIENCE)).map_err(of)?;
         stream.set_write_timeout(Some(PATIENCE)).map_err(of)?;
         let mut connection = ClientConnection::new(Arc::new(config), name).map_err(|error| error.to_string())?;
@@ -84,7 +84,7 @@ impl KeyFile {
         let mut tls = Stream::new(&mut connection, &mut stream);
         tls.flush().map_err(of)?;
         match tls.read(&mut [0]) {
-            // It says nothing before its client does.
+            // The server is silent until its client writes.
             Err(error) if matches!(error.kind(), ErrorKind::WouldBlock | ErrorKind::TimedOut) => Ok(()),
             Ok(0) => Err(format!("the rig '{rig}' at {address} hung up; try again")),
             Ok(_) => Ok(()),
@@ -92,7 +92,8 @@ impl KeyFile {
         }
     }
 
-    fn words(&self, address: &str, error: &std::io::Error) -> String {
+    /// Explains a failed connection and the fix.
+    fn explain(&self, address: &str, error: &std::io::Error) -> String {
         let Self { rig, holder, expires, .. } = self;
         let tls = error.get_ref().and_then(|inner| inner.downcast_ref::<TlsError>());
         let refuses = format!("the rig '{rig}' refuses the key of '{holder}'");
@@ -122,7 +123,7 @@ impl KeyFile {
                 CertificateError::NotValidYet | CertificateError::NotValidYetContext { .. } => {
                     format!("the certificate of the rig '{rig}' is not valid yet; compare the computers' clocks")
                 }
-                _ => format!("{address} is not the rig '{rig}': its certificate is signed by somebody else"),
+                _ => format!("{address} is not the rig '{rig}': its certificate is signed by another authority"),
             },
             Some(other) => format!("{address} does not speak as a rig with keys does ({other})"),
             None if matches!(error.kind(), ErrorKind::WouldBlock | ErrorKind::TimedOut) => {
@@ -133,9 +134,9 @@ impl KeyFile {
     }
 }
 
-/// Knocks at the rig again and again while nothing comes from it, to know why.
+/// Thread that tries a key repeatedly while there is no connection, to report why.
 #[derive(Debug)]
-pub struct Probe {
+pub struct KeyProbe {
     shared: Arc<Shared>,
     thread: Option<JoinHandle<()>>,
 }
@@ -146,11 +147,11 @@ struct Shared {
     stop: AtomicBool,
 }
 
-impl Probe {
+impl KeyProbe {
     /// Starts the thread, which is idle while `is_connected`.
     ///
     /// # Errors
-    /// [`AccessError::System`] when there is no thread.
+    /// [`AccessError::System`] when no thread can be started.
     pub fn start(key: KeyFile, is_connected: impl Fn() -> bool + Send + 'static) -> Result<Self, AccessError> {
         let shared = Arc::<Shared>::default();
         let of_thread = Arc::clone(&shared);
@@ -165,15 +166,15 @@ impl Probe {
         Ok(Self { shared, thread: Some(thread) })
     }
 
-    /// Returns why the rig cannot be reached; None while it can, or while that is not known.
+    /// Returns why the rig rejects the key or cannot be reached; `None` once it accepts the key, and before the first answer.
     #[must_use]
     pub fn trouble(&self) -> Option<String> {
         lock(&self.shared.trouble).clone()
     }
 }
 
-/// Does not wait for an attempt under way.
-impl Drop for Probe {
+impl Drop for KeyProbe {
+    /// Ends the thread, without waiting for an attempt under way.
     fn drop(&mut self) {
         self.shared.stop.store(true, Ordering::Relaxed);
         if let Some(thread) = self.thread.take() {

@@ -1,4 +1,4 @@
-//! The folder of a rig's keys.
+//! Folder of a rig's keys: authority, own certificate, list of holders.
 
 use std::{
     io::Write as _,
@@ -11,59 +11,34 @@ use rustls_pki_types::{CertificateDer, pem::PemObject as _};
 use serde::{Deserialize, Serialize};
 
 use crate::{
-    AccessError, KeyFile, Role,
-    issue::{Authority, Pair, Side},
+    error::AccessError,
+    holder::{Holder, MAX_HOLDERS},
+    issue::{Authority, CertificatePair, TlsSide},
+    key_file::KeyFile,
+    role::Role,
+    secret_file::write_secret,
 };
 
-/// Port of the gate for viewers unless another one is chosen; cameras have the next.
+/// Default port of the gate for viewers; cameras have the next port.
 pub const DEFAULT_PORT: u16 = 7450;
-/// Most holders at a time.
-pub const MAX_HOLDERS: usize = 256;
-/// Revoked holders that stay listed.
+/// Largest number of revoked holders that stay listed.
 const MAX_REVOKED: usize = 256;
 /// Largest file that is read, bytes.
 const MAX_BYTES: u64 = 1 << 20;
 /// Version of the format.
 const VERSION: u32 = 1;
-/// Days that authority and rig are valid.
+/// Validity of the certificates of authority and rig, days.
 const RING_DAYS: u64 = 3650;
 const LIST: &str = "ring.toml";
 const AUTHORITY: [&str; 2] = ["authority.pem", "authority-key.pem"];
 const OWN: [&str; 2] = ["rig.pem", "rig-key.pem"];
-
-/// Holder of a key.
-#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
-#[serde(deny_unknown_fields)]
-pub struct Holder {
-    /// Its name.
-    pub name: String,
-    /// Role: the rights of the holder.
-    pub role: Role,
-    /// Its number among the holders, 0..[`MAX_HOLDERS`].
-    pub number: usize,
-    /// Time after which it is refused, RFC 3339.
-    pub expires: String,
-    /// SHA-256 of its certificate, hexadecimal.
-    pub fingerprint: String,
-    /// Whether it is refused.
-    #[serde(default)]
-    pub revoked: bool,
-}
-
-impl Holder {
-    /// Returns the time after which it is refused; a time that cannot be read is in the past.
-    #[must_use]
-    pub fn expires_at(&self) -> SystemTime {
-        humantime::parse_rfc3339(&self.expires).unwrap_or(UNIX_EPOCH)
-    }
-}
 
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 struct List {
     version: u32,
     rig: String,
-    /// Hexadecimal; part of names in certificates and topics.
+    /// Identifier, hexadecimal, which is part of names in certificates and topics.
     id: String,
     hosts: Vec<String>,
     listen: SocketAddr,
@@ -76,17 +51,17 @@ pub struct Ring {
     folder: PathBuf,
     list: List,
     authority: Authority,
-    own: Pair,
+    own: CertificatePair,
 }
 
-/// Without secrets.
 impl std::fmt::Debug for Ring {
+    /// Formats the ring without secrets.
     fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
         f.debug_struct("Ring").field("folder", &self.folder).field("list", &self.list).finish_non_exhaustive()
     }
 }
 
-/// SHA-256 of a certificate, hexadecimal.
+/// Returns the SHA-256 of a certificate, hexadecimal.
 pub(crate) fn fingerprint(certificate: &[u8]) -> String {
     let digest = ring::digest::digest(&ring::digest::SHA256, certificate);
     digest.as_ref().iter().map(|byte| format!("{byte:02x}")).collect()
@@ -94,23 +69,6 @@ pub(crate) fn fingerprint(certificate: &[u8]) -> String {
 
 fn unix_secs() -> u64 {
     SystemTime::now().duration_since(UNIX_EPOCH).map_or(0, |since| since.as_secs())
-}
-
-/// Writes a file for its owner alone; it must not be there.
-pub(crate) fn write_secret(path: &Path, text: &str) -> Result<(), AccessError> {
-    let mut options = std::fs::OpenOptions::new();
-    options.write(true).create_new(true);
-    #[cfg(unix)]
-    std::os::unix::fs::OpenOptionsExt::mode(&mut options, 0o600);
-    let written = options
-        .open(path)
-        .and_then(|mut out| out.write_all(text.as_bytes()).inspect_err(|_| drop(std::fs::remove_file(path))));
-    written.map_err(|error| match error.kind() {
-        std::io::ErrorKind::AlreadyExists => {
-            AccessError::file(path, "is there already; choose another name, or move it away")
-        }
-        _ => AccessError::file(path, format!("cannot be written ({error})")),
-    })
 }
 
 fn read(path: &Path) -> Result<String, AccessError> {
@@ -123,7 +81,7 @@ fn read(path: &Path) -> Result<String, AccessError> {
     std::fs::read_to_string(path).map_err(of)
 }
 
-/// Checks a name of a rig or holder.
+/// Checks the name of a rig or holder.
 fn check_name(what: &str, name: &str) -> Result<(), AccessError> {
     if (1..=64).contains(&name.len()) && name.bytes().all(|b| b.is_ascii_alphanumeric() || b"_-".contains(&b)) {
         return Ok(());
@@ -131,7 +89,7 @@ fn check_name(what: &str, name: &str) -> Result<(), AccessError> {
     Err(AccessError::Request(format!("{what} '{name}': use 1 to 64 of the characters A-Z a-z 0-9 _ -")))
 }
 
-/// Reads the list of holders alone; the gate does it again and again.
+/// Reads the list of holders alone; the gate does so repeatedly.
 pub(crate) fn read_holders(folder: &Path) -> Result<Vec<Holder>, AccessError> {
     read_list(folder).map(|list| list.holders)
 }
@@ -147,16 +105,16 @@ fn read_list(folder: &Path) -> Result<List, AccessError> {
     Ok(list)
 }
 
-/// File name and modification time of the list, by which a change is noticed.
+/// Returns the modification time of the list, which reveals a change.
 pub(crate) fn list_time(folder: &Path) -> Option<SystemTime> {
     std::fs::metadata(folder.join(LIST)).and_then(|of| of.modified()).ok()
 }
 
 impl Ring {
-    /// Makes a new ring in a folder that is not there yet. `hosts` are names and addresses by which other computers reach the rig.
+    /// Creates a ring in a new folder. `hosts` are names and addresses by which other computers reach the rig.
     ///
     /// # Errors
-    /// [`AccessError::Request`] for a bad name or no host, [`AccessError::File`] when the folder is there or cannot be written.
+    /// [`AccessError::Request`] for a bad name or no host, [`AccessError::File`] when the folder exists or cannot be written.
     pub fn create(folder: &Path, rig: &str, hosts: &[String], port: u16) -> Result<Self, AccessError> {
         check_name("rig", rig)?;
         if hosts.is_empty() {
@@ -182,7 +140,7 @@ impl Ring {
         let now = unix_secs();
         let valid = (now, now + RING_DAYS * 86_400);
         let (authority, secret) = Authority::new(&authority_name(&list), valid)?;
-        let own = authority.sign(&own_name(&list), hosts, Side::Server, valid)?;
+        let own = authority.sign(&own_name(&list), hosts, TlsSide::Server, valid)?;
         let failed = |error: std::io::Error| match error.kind() {
             std::io::ErrorKind::AlreadyExists => {
                 AccessError::file(folder, "is there already; name a new folder with --out")
@@ -198,7 +156,7 @@ impl Ring {
             write_secret(&folder.join(OWN[0]), &ring.own.certificate)?;
             ring.save()
         };
-        // It was made just now and holds nothing else.
+        // The folder was created just now and holds nothing else.
         write().inspect_err(|_| drop(std::fs::remove_dir_all(folder)))?;
         Ok(ring)
     }
@@ -206,11 +164,11 @@ impl Ring {
     /// Opens a ring.
     ///
     /// # Errors
-    /// [`AccessError::File`] with the file that is missing or damaged.
+    /// [`AccessError::File`] names the file that is missing or damaged.
     pub fn open(folder: &Path) -> Result<Self, AccessError> {
         let list = read_list(folder)?;
         let pair = |names: [&str; 2]| {
-            Ok::<_, AccessError>(Pair {
+            Ok::<_, AccessError>(CertificatePair {
                 certificate: read(&folder.join(names[0]))?,
                 key: read(&folder.join(names[1]))?,
             })
@@ -238,7 +196,7 @@ impl Ring {
         &self.list.hosts
     }
 
-    /// Returns everybody who was given a key.
+    /// Returns all holders, revoked ones included.
     #[must_use]
     pub fn holders(&self) -> &[Holder] {
         &self.list.holders
@@ -264,7 +222,7 @@ impl Ring {
         format!("{}-{number}", self.list.id)
     }
 
-    pub(crate) fn own(&self) -> &Pair {
+    pub(crate) fn own(&self) -> &CertificatePair {
         &self.own
     }
 
@@ -272,7 +230,7 @@ impl Ring {
         &self.authority
     }
 
-    /// Makes a key, valid for `days`.
+    /// Issues a key, valid for `days`.
     ///
     /// # Errors
     /// [`AccessError::Request`] for a bad name, a name that is taken, or more holders than there is room for.
@@ -283,7 +241,7 @@ impl Ring {
                 "'{name}' has a key already; make a new one with `flyrig keys renew {name}`, or take it away with `flyrig keys revoke {name}`"
             )));
         }
-        // Numbers of holders who are revoked are free: they are refused by their certificates.
+        // Numbers of revoked holders are free: those are refused by their certificates.
         let taken = |number: &usize| self.list.holders.iter().any(|of| of.number == *number && !of.revoked);
         let Some(number) = (0..MAX_HOLDERS).find(|number| !taken(number)) else {
             return Err(AccessError::Request(format!("there are {MAX_HOLDERS} keys already; revoke one")));
@@ -291,29 +249,31 @@ impl Ring {
         self.issue(name, role, number, days)
     }
 
-    /// Makes a new key of a holder, valid for `days`; the old one is refused from now on.
+    /// Issues a new key to a holder, valid for `days`; the old one is refused from now on.
     ///
     /// # Errors
-    /// [`AccessError::Request`] when nobody of this name has a key.
+    /// [`AccessError::Request`] when no holder of this name has a key.
     pub fn renew(&mut self, name: &str, days: u64) -> Result<KeyFile, AccessError> {
-        let Some(Holder { role, number, .. }) = self.valid_holder(name).cloned() else { return Err(self.nobody(name)) };
+        let Some(Holder { role, number, .. }) = self.valid_holder(name).cloned() else {
+            return Err(self.unknown_holder(name));
+        };
         self.mark_revoked(name);
         self.issue(name, role, number, days)
     }
 
-    /// Refuses a holder from now on; an open gate disconnects it.
+    /// Revokes the key of a holder; an open gate disconnects it.
     ///
     /// # Errors
-    /// [`AccessError::Request`] when nobody of this name has a key.
+    /// [`AccessError::Request`] when no holder of this name has a key.
     pub fn revoke(&mut self, name: &str) -> Result<(), AccessError> {
         if self.valid_holder(name).is_none() {
-            return Err(self.nobody(name));
+            return Err(self.unknown_holder(name));
         }
         self.mark_revoked(name);
         self.save()
     }
 
-    /// Gives a holder a new key that ends at a time, in seconds since 1970.
+    /// Issues a new key to a holder that ends at a time, in seconds since 1970.
     #[cfg(test)]
     pub(crate) fn replace_validity(&mut self, name: &str, end: u64) -> KeyFile {
         let Some(Holder { role, number, .. }) = self.valid_holder(name).cloned() else { panic!("no '{name}'") };
@@ -325,9 +285,10 @@ impl Ring {
         self.list.holders.iter().find(|of| of.name == name && !of.revoked)
     }
 
-    fn nobody(&self, name: &str) -> AccessError {
+    fn unknown_holder(&self, name: &str) -> AccessError {
         let names: Vec<&str> = self.list.holders.iter().filter(|of| !of.revoked).map(|of| of.name.as_str()).collect();
-        let known = if names.is_empty() { "nobody has one".to_owned() } else { format!("known: {}", names.join(", ")) };
+        let known =
+            if names.is_empty() { "there are no holders".to_owned() } else { format!("known: {}", names.join(", ")) };
         AccessError::Request(format!("'{name}' has no key; {known}"))
     }
 
@@ -346,7 +307,7 @@ impl Ring {
     }
 
     fn issue_until(&mut self, name: &str, role: Role, number: usize, end: u64) -> Result<KeyFile, AccessError> {
-        let pair = self.authority.sign(name, &[], Side::Client, (unix_secs(), end))?;
+        let pair = self.authority.sign(name, &[], TlsSide::Client, (unix_secs(), end))?;
         let der = CertificateDer::from_pem_slice(pair.certificate.as_bytes()).map_err(AccessError::system)?;
         let expires = humantime::format_rfc3339_seconds(UNIX_EPOCH + Duration::from_secs(end)).to_string();
         let holder =
@@ -362,7 +323,7 @@ impl Ring {
         Ok(file)
     }
 
-    /// Forgets those who were revoked longest ago: whoever is not in the list is refused as well.
+    /// Forgets the holders revoked longest ago: holders that are not listed are refused as well.
     fn forget_oldest(&mut self) {
         let mut over = self.list.holders.iter().filter(|of| of.revoked).count().saturating_sub(MAX_REVOKED);
         self.list.holders.retain(|of| {
@@ -384,12 +345,12 @@ impl Ring {
     }
 }
 
-/// Name in the certificate of the authority.
+/// Returns the name in the certificate of the authority.
 fn authority_name(list: &List) -> String {
     format!("flyrig authority of {} {}", list.rig, list.id)
 }
 
-/// Name in the rig's certificate. It is no host's: no public authority signs one.
+/// Returns the name in the rig's certificate. It is no host name, so no public authority signs it.
 fn own_name(list: &List) -> String {
     format!("flyrig rig {} {}", list.rig, list.id)
 }

@@ -2,20 +2,20 @@
 
 use serde::{Deserialize, Serialize};
 
-/// Role of a key's holder: its rights.
+/// Role of a key's holder, which determines its rights.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, Serialize, Deserialize)]
 #[serde(rename_all = "lowercase")]
 pub enum Role {
-    /// Watches: receives people, views, statistics and calibration, and may have a viewpoint of its own. Publishes nothing.
+    /// Viewer: receives people, views, statistics and calibration, and may have a viewpoint of its own. It publishes nothing.
     Viewer,
-    /// Sends images of cameras. Receives nothing but questions for its clock.
+    /// Computer with cameras: sends images. It receives nothing but queries of its clock.
     Cameras,
-    /// Watches as a viewer does, and may pass people on to viewers of its own.
+    /// Relay: receives like a viewer, and may pass people on to viewers of its own.
     Relay,
 }
 
 impl Role {
-    /// Every role.
+    /// All roles.
     pub const ALL: [Self; 3] = [Self::Viewer, Self::Cameras, Self::Relay];
 
     /// Returns the role's name in files and on the command line.

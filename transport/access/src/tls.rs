@@ -1,4 +1,4 @@
-//! Both sides of TLS.
+//! TLS settings of both sides.
 
 use std::sync::Arc;
 
@@ -10,6 +10,7 @@ use tokio_rustls::rustls::{
     version::TLS13,
 };
 
+/// Returns the cryptography of all connections.
 pub(crate) fn provider() -> Arc<CryptoProvider> {
     Arc::new(ring::default_provider())
 }
@@ -33,7 +34,7 @@ fn pair(certificate: &str, key: &str) -> Result<(Vec<CertificateDer<'static>>, P
     Ok((chain, key))
 }
 
-/// Client that trusts this authority alone.
+/// Returns the settings of a client that trusts this authority alone.
 pub(crate) fn client(authority: &str, certificate: &str, key: &str) -> Result<ClientConfig, String> {
     let (chain, key) = pair(certificate, key)?;
     ClientConfig::builder_with_provider(provider())
@@ -44,14 +45,14 @@ pub(crate) fn client(authority: &str, certificate: &str, key: &str) -> Result<Cl
         .map_err(|error| format!("private key: {error}"))
 }
 
-/// Checks that a client's certificate is signed by this authority.
+/// Returns a verifier of client certificates signed by this authority.
 pub(crate) fn client_verifier(authority: &str) -> Result<Arc<dyn ClientCertVerifier>, String> {
     WebPkiClientVerifier::builder_with_provider(roots(authority)?, provider())
         .build()
         .map_err(|error| error.to_string())
 }
 
-/// Server that asks `verifier` about clients.
+/// Returns the settings of a server whose clients `verifier` checks.
 pub(crate) fn server(
     verifier: Arc<dyn ClientCertVerifier>,
     certificate: &str,
@@ -64,7 +65,7 @@ pub(crate) fn server(
         .with_client_cert_verifier(verifier)
         .with_single_cert(chain, key)
         .map_err(|error| format!("private key: {error}"))?;
-    // A ticket would let a holder back in without its certificate.
+    // A ticket would admit a holder again without its certificate.
     config.send_tls13_tickets = 0;
     Ok(config)
 }

@@ -1,9 +1,9 @@
-//! The template of a person who is driven by poses alone: Gaussians of three scales with their colours, once.
+//! Template of a person that is driven by poses alone: anisotropic Gaussians with their colours.
 //!
-//! A message is `FLA`, the codec's version, the length of a template without nodes and that template, the terms of the light as 27 `f32`, then
-//! planes of bytes, one element a Gaussian in the template's order: three of logarithms of scales, four of a rotation, one of the opacity, three of sRGB. The template
-//! inside holds centres, skin, normals and one round size for viewers that draw isotropic Gaussians. Its hash is that of the whole
-//! message.
+//! A message is `FLA`, the codec's version, the length of a template without nodes and that template, the terms of the light as 27 `f32`,
+//! then planes of bytes with one element per Gaussian in the template's order: three of logarithms of scales, four of a rotation, one of
+//! the opacity, three of sRGB. The inner template holds centres, skin, normals and one isotropic size for viewers that draw isotropic
+//! Gaussians. The hash is that of the whole message. Every further message of an avatar is a pose: no node translations, no colours.
 
 use alloc::vec::Vec;
 
@@ -13,61 +13,71 @@ use flyrig_model::{
 };
 
 use crate::{
-    CODEC_VERSION, EncodedTemplate, Motion, Posed, StreamError, StreamTemplate, TemplateSource,
+    attributes::AvatarAttributes,
     bytes::Fields,
+    error::StreamError,
+    message::{AVATAR_MAGIC, CODEC_VERSION},
+    motion::Motion,
+    pose::Posed,
     srgb::Srgb,
-    template::{MAX_TEMPLATE_BYTES, template_hash},
+    template::{EncodedTemplate, MAX_TEMPLATE_BYTES, StreamTemplate, TemplateSource, template_hash},
 };
 
-pub(crate) const MAGIC: [u8; 3] = *b"FLA";
 const WHAT: &str = "avatar";
 /// Smallest scale, metres, and natural logarithm of the largest over it (0.1 m).
 const LEAST_SCALE_M: f32 = 2e-4;
 const SCALE_RANGE: f32 = 6.214_608;
-/// Planes of bytes.
+/// Number of planes of bytes.
 const PLANES: usize = 11;
-/// Number of terms of an avatar's light, see [`light::Terms`].
-pub const LIGHT_TERMS: usize = light::TERMS;
-/// Steps of a component of a rotation, whose range is 1/sqrt(2) to either side.
+/// Quantisation steps of a rotation's component, which lies in -1/sqrt(2)..=1/sqrt(2).
 const ROTATION_STEPS: f32 = 1023.0;
 
-/// A Gaussian of an avatar beyond its centre and skin.
+/// Attributes of an avatar's Gaussian beside centre and skin.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct AvatarGaussian {
     /// Standard deviations along the Gaussian's own axes, canonical metres; kept to 1.3 % within 0.2 mm to 100 mm.
     pub scale_m: [f32; 3],
     /// Opacity, 0..=1.
     pub opacity: f32,
-    /// Quaternion x, y, z, w of any length: canonical from the Gaussian's axes.
+    /// Quaternion x, y, z, w of any length: canonical space from the Gaussian's axes.
     pub rotation: [f32; 4],
     /// Linear RGB, 0..=1.
     pub color: [f32; 3],
 }
 
-/// An avatar as the rig knows it.
+/// Avatar to encode.
+///
+/// ```
+/// use flyrig_stream::{AvatarGaussian, AvatarSource, LIGHT_TERMS, StreamJoint, StreamTemplate, TemplateSource};
+///
+/// let rows = [[1.0, 0.0, 0.0, 0.0], [0.0, 1.0, 0.0, 0.0], [0.0, 0.0, 1.0, 0.0]];
+/// let template = TemplateSource {
+///     joints: &[StreamJoint { parent: None, translation: [0.0; 3], joint_from_canonical: rows }],
+///     center_scale: &[[0.0, 1.0, 0.0, 0.01]],
+///     normals: &[[0.0, 0.0, 1.0]],
+///     skin: &[([0; 4], [1.0, 0.0, 0.0, 0.0])],
+///     node_weights: &[],
+///     nodes: &[],
+/// };
+/// let gaussian =
+///     AvatarGaussian { scale_m: [0.02, 0.01, 0.002], opacity: 0.9, rotation: [0.0, 0.0, 0.0, 1.0], color: [0.5, 0.2, 0.1] };
+/// let mut light = [[0.0; 3]; LIGHT_TERMS];
+/// light[0] = [1.0; 3];
+/// let encoded = AvatarSource { template, gaussians: &[gaussian], light }.encode()?;
+/// assert!(StreamTemplate::decode(&encoded.bytes)?.is_avatar());
+/// # Ok::<(), flyrig_stream::StreamError>(())
+/// ```
 #[derive(Debug, Clone, Copy)]
 pub struct AvatarSource<'a> {
-    /// Centres with round sizes, normals and skin; without nodes.
+    /// Centres with isotropic sizes, normals and skin; without nodes.
     pub template: TemplateSource<'a>,
-    /// As many Gaussians.
+    /// Attributes of the Gaussians, in the order of `template`.
     pub gaussians: &'a [AvatarGaussian],
-    /// Factors of the colours by the direction that the surface faces in the world: red, green and blue of each term.
+    /// Light: factors of red, green and blue for each term of the surface's normal in the world.
     pub light: light::Terms,
 }
 
-/// Shapes, colours and light of an avatar, in the template's order of Gaussians.
-#[derive(Debug, Clone, PartialEq)]
-pub(crate) struct Avatar {
-    /// Standard deviations, metres; w: opacity.
-    scale_opacity: Vec<[f32; 4]>,
-    /// Canonical from the Gaussian's axes, a unit quaternion x, y, z, w.
-    rotation: Vec<[f32; 4]>,
-    /// Linear RGB without the light; w: opacity.
-    colors: Vec<[f32; 4]>,
-    light: light::Terms,
-}
-
-/// Shapes of an avatar's Gaussians in the world; both lists have one element a Gaussian.
+/// Shapes of an avatar's Gaussians in the world; both lists have one element per Gaussian.
 #[derive(Debug, Clone, Default, PartialEq)]
 pub struct PosedAxes {
     /// Standard deviations along the Gaussian's own axes, metres; w: opacity.
@@ -77,7 +87,7 @@ pub struct PosedAxes {
 }
 
 impl AvatarSource<'_> {
-    /// Orders, quantises and encodes it.
+    /// Orders, quantises and encodes the avatar.
     ///
     /// # Errors
     /// [`StreamError::Template`] when counts differ, there are nodes, or a number is not finite.
@@ -93,7 +103,7 @@ impl AvatarSource<'_> {
         let inner = self.template.encode()?;
         let srgb = Srgb::new();
         let mut bytes = Vec::new();
-        bytes.extend(MAGIC);
+        bytes.extend(AVATAR_MAGIC);
         bytes.push(CODEC_VERSION);
         bytes.extend((inner.bytes.len() as u32).to_le_bytes());
         bytes.extend(&inner.bytes);
@@ -117,12 +127,12 @@ impl AvatarSource<'_> {
     }
 }
 
-/// Reads an avatar's bytes.
+/// Decodes an avatar.
 ///
 /// # Errors
 /// [`StreamError::Version`] or [`StreamError::Malformed`].
-pub(crate) fn decode(bytes: &[u8]) -> Result<StreamTemplate, StreamError> {
-    let mut fields = Fields::of(WHAT, MAGIC, bytes)?;
+fn decode(bytes: &[u8]) -> Result<StreamTemplate, StreamError> {
+    let mut fields = Fields::new(WHAT, AVATAR_MAGIC, bytes)?;
     fields.check(bytes.len() <= MAX_TEMPLATE_BYTES, "it is too large")?;
     let length = fields.u32()? as usize;
     fields.check(length <= fields.bytes.len(), "it is cut short")?;
@@ -140,7 +150,7 @@ pub(crate) fn decode(bytes: &[u8]) -> Result<StreamTemplate, StreamError> {
     fields.check(planes.len() == PLANES * count, "its planes are of another number of Gaussians")?;
     let srgb = Srgb::new();
     let at = |plane: usize, i: usize| planes[plane * count + i];
-    let mut avatar = Avatar {
+    let mut avatar = AvatarAttributes {
         scale_opacity: Vec::with_capacity(count),
         rotation: Vec::with_capacity(count),
         colors: Vec::with_capacity(count),
@@ -160,14 +170,22 @@ pub(crate) fn decode(bytes: &[u8]) -> Result<StreamTemplate, StreamError> {
 }
 
 impl StreamTemplate {
-    /// Whether the template has the colours: they are not sent apart.
+    /// Decodes a template, or an avatar.
+    ///
+    /// # Errors
+    /// [`StreamError::Version`] or [`StreamError::Malformed`].
+    pub fn decode(bytes: &[u8]) -> Result<Self, StreamError> {
+        if bytes.starts_with(&AVATAR_MAGIC) { decode(bytes) } else { Self::decode_surface(bytes) }
+    }
+
+    /// Returns whether the template is an avatar, whose colours are part of it.
     #[must_use]
     pub fn is_avatar(&self) -> bool {
         self.avatar.is_some()
     }
 
-    /// Returns the avatar's colours, linear RGB and opacity of each Gaussian, as its light shows them in a pose of [`Self::pose`]. Returns
-    /// false, and changes nothing, for a template whose colours are sent apart.
+    /// Computes the colours of an avatar, linear RGB and opacity of each Gaussian, lit in a pose of [`Self::pose`]. Returns false, and
+    /// changes nothing, for a template whose colours are separate messages.
     pub fn avatar_colors(&self, posed: &Posed, colors: &mut Vec<[f32; 4]>) -> bool {
         let Some(avatar) = &self.avatar else { return false };
         colors.clone_from(&avatar.colors);
@@ -178,7 +196,7 @@ impl StreamTemplate {
         true
     }
 
-    /// Poses the shapes of an avatar's Gaussians; centres are those of [`Self::pose`]. A rotation is the normalised blend of the joints'
+    /// Poses the shapes of an avatar's Gaussians, whose centres are those of [`Self::pose`]. A rotation is the normalised blend of the joints'
     /// quaternions. Returns false, and changes nothing, for a template of isotropic Gaussians.
     pub fn pose_axes(&self, motion: &Motion, posed: &mut PosedAxes) -> bool {
         let Some(avatar) = &self.avatar else { return false };
@@ -189,7 +207,7 @@ impl StreamTemplate {
             let mut sum = [0.0f32; 4];
             for (joint, share) in skin.shares() {
                 let turn = turns.get(joint).copied().unwrap_or(IDENTITY);
-                // A quaternion and its negative are the same turn.
+                // A quaternion and its negative are the same rotation.
                 let along: f32 = sum.iter().zip(turn).map(|(a, b)| a * b).sum();
                 let share = if along < 0.0 { -share } else { share };
                 sum.iter_mut().zip(turn).for_each(|(sum, turn)| *sum += share * turn);
@@ -200,7 +218,7 @@ impl StreamTemplate {
     }
 }
 
-/// Bytes of the light.
+/// Encoded length of the light, bytes.
 const LIGHT_BYTES: usize = 4 * 3 * light::TERMS;
 
 /// Returns the unit quaternion of the linear part of a rigid motion.
@@ -217,7 +235,7 @@ fn scale_of(code: u8) -> f32 {
     LEAST_SCALE_M * libm::expf(SCALE_RANGE * f32::from(code) / 255.0)
 }
 
-/// The three smaller components in ten bits each, and which one is left out in two.
+/// Packs a rotation: the index of its largest component in two bits, the other three in ten bits each.
 fn rotation_code(q: [f32; 4]) -> u32 {
     let q = unit(q);
     let largest = (0..4).fold(0, |best, k| if q[k].abs() > q[best].abs() { k } else { best });
@@ -230,6 +248,7 @@ fn rotation_code(q: [f32; 4]) -> u32 {
     code
 }
 
+/// Unpacks a rotation.
 fn rotation_of(code: u32) -> [f32; 4] {
     let largest = (code >> 30) as usize;
     let mut q = [0.0; 4];

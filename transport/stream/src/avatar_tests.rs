@@ -11,7 +11,7 @@ use crate::{
     testing::{Person, damaged},
 };
 
-/// Darker from the left, red from above.
+/// Light that is darker from the left and red from above.
 const LIGHT: [[f32; 3]; LIGHT_TERMS] = {
     let mut light = [[0.0; 3]; LIGHT_TERMS];
     light[0] = [1.0; 3];
@@ -36,7 +36,7 @@ fn encoded(person: &Person, gaussians: &[AvatarGaussian]) -> EncodedTemplate {
     AvatarSource { template: person.source(), gaussians, light: LIGHT }.encode().unwrap()
 }
 
-/// Rows of a unit quaternion's matrix in f64.
+/// Returns the rows of a unit quaternion's matrix in f64.
 fn matrix(q: [f64; 4]) -> [[f64; 3]; 3] {
     let length = q.iter().map(|v| v * v).sum::<f64>().sqrt();
     let [x, y, z, w] = q.map(|v| v / length);
@@ -58,7 +58,7 @@ fn times(a: [f64; 4], b: [f64; 4]) -> [f64; 4] {
     ]
 }
 
-/// Largest difference between two rotations' matrices.
+/// Returns the largest difference between two rotations' matrices.
 fn apart(a: [f64; 4], b: [f64; 4]) -> f64 {
     let rows = matrix(a).into_iter().flatten().zip(matrix(b).into_iter().flatten());
     rows.map(|(a, b)| (a - b).abs()).fold(0.0, f64::max)

@@ -1,8 +1,8 @@
-//! Little-endian fields.
+//! Little-endian fields of a message.
 
-use crate::StreamError;
+use crate::{error::StreamError, message::CODEC_VERSION};
 
-/// Takes fields off the front of a message.
+/// Reader of fields off the front of a message.
 pub(crate) struct Fields<'a> {
     /// Name of the message, for errors.
     pub what: &'static str,
@@ -10,14 +10,14 @@ pub(crate) struct Fields<'a> {
 }
 
 impl<'a> Fields<'a> {
-    /// Of a message that begins with a magic number and the codec's version.
-    pub fn of(what: &'static str, magic: [u8; 3], bytes: &'a [u8]) -> Result<Self, StreamError> {
+    /// Reads the magic letters and the codec's version of a message; refuses others.
+    pub fn new(what: &'static str, magic: [u8; 3], bytes: &'a [u8]) -> Result<Self, StreamError> {
         let mut fields = Self { what, bytes };
         if fields.take::<3>()? != magic {
             return Err(StreamError::Malformed { what, problem: "it does not begin with the message's three letters" });
         }
         match fields.take::<1>()? {
-            [crate::CODEC_VERSION] => Ok(fields),
+            [CODEC_VERSION] => Ok(fields),
             [found] => Err(StreamError::Version { what, found }),
         }
     }
@@ -49,7 +49,7 @@ impl<'a> Fields<'a> {
         self.take().map(i64::from_le_bytes)
     }
 
-    /// A finite number.
+    /// Reads a finite number.
     pub fn f32(&mut self) -> Result<f32, StreamError> {
         let number = self.take().map(f32::from_le_bytes)?;
         self.check(number.is_finite(), "a number is not finite")?;

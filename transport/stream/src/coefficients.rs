@@ -1,4 +1,4 @@
-//! Coding of quantised coefficients: three levels of the tree at a time, with blocks of zeros in one decision.
+//! Coding of quantised coefficients: three levels of the tree at a time, a block of zeros in one decision.
 
 use core::ops::Range;
 
@@ -8,24 +8,24 @@ use crate::{
     tree::{CHANNELS, HaarTree},
 };
 
-/// A coefficient's channels, in steps.
+/// Channels of a coefficient, in quantisation steps.
 pub(crate) type Levels = [i32; CHANNELS];
 
-/// Levels in a group.
+/// Number of levels in a group.
 pub(crate) const GROUP: u32 = 3;
 
-/// Most nodes of a block, and the level of each below the first.
+/// Largest number of nodes of a block, and the level of each below the first.
 const BLOCK: usize = (1 << GROUP) - 1;
 const LEVEL: [usize; BLOCK] = [0, 1, 1, 2, 2, 2, 2];
 
-/// Probabilities of one message, which adapt from its beginning to its end.
+/// Probabilities of one message, which adapt along it.
 #[derive(Debug, Clone, Copy, Default)]
 pub(crate) struct CoefficientModel {
-    /// Whether a block is not all zero, by the same of the two blocks before it.
+    /// Probability that a block is all zero, by whether the two blocks before it are.
     block: [Probability; 4],
-    /// Whether a channel of a block is not all zero, by the channels before it.
+    /// Probability that a channel of a block is all zero, by the channels before it.
     channel: [[Probability; 4]; CHANNELS],
-    /// Whether a coefficient is not zero, by channel, level in the group and neighbours.
+    /// Probability that a coefficient is zero, by channel, level in the group and neighbours.
     nonzero: [[[Probability; 4]; GROUP as usize]; CHANNELS],
     magnitude: [[MagnitudeModel; GROUP as usize]; CHANNELS],
     mean_nonzero: [Probability; CHANNELS],
@@ -41,8 +41,8 @@ impl CoefficientModel {
         }
     }
 
-    /// Codes the coefficients of some levels of a segment, at most [`GROUP`]. `values` is the list of all coefficients; those that
-    /// have no item must be 0.
+    /// Codes the coefficients of up to [`GROUP`] levels of a segment. `values` is the list of all coefficients; those without an item must
+    /// be 0.
     pub fn code_group<C: BitCoder>(
         &mut self,
         coder: &mut C,
@@ -54,7 +54,7 @@ impl CoefficientModel {
         let mut history = 0;
         let depth = levels.end - levels.start;
         for root in tree.places(levels.start, segment) {
-            // Nodes below one another lie side by side: the node, its two halves, their halves.
+            // A node, its two halves and their halves lie side by side in each level.
             let is_any = C::WRITES
                 && (0..depth).any(|below| {
                     let nodes = &values[root << below..(root + 1) << below];
@@ -70,7 +70,7 @@ impl CoefficientModel {
         }
     }
 
-    /// Codes a node and those below it, of which one is not zero.
+    /// Codes a node and those below it, at least one of which is not zero.
     fn code_block<C: BitCoder>(
         &mut self,
         coder: &mut C,

@@ -21,7 +21,7 @@ fn code(linear: f32) -> f64 {
     255.0 * if linear <= 0.003_130_8 { linear * 12.92 } else { 1.055 * linear.powf(1.0 / 2.4) - 0.055 }
 }
 
-/// Root mean square error of the decoder's colours, sRGB codes.
+/// Returns the root mean square error of the decoder's colours, sRGB codes.
 fn rms(decoder: &mut ColorDecoder, encoded: &EncodedTemplate, truth: &[[f32; 4]]) -> f64 {
     let mut colors = Vec::new();
     decoder.colors(&mut colors);
@@ -43,7 +43,7 @@ fn colours_follow_within_their_step() {
         for frame in 0..20 {
             let colors = person.colors(0.02 * frame as f32);
             for message in encoder.encode(stamp(frame), &colors) {
-                assert_eq!(decoder.take(&message).unwrap().frame, frame);
+                assert_eq!(decoder.ingest(&message).unwrap().frame, frame);
             }
             let error = rms(&mut decoder, &encoded, &colors);
             assert!(error < 0.6 * f64::from(step), "{step} {frame}: {error}");
@@ -79,12 +79,12 @@ fn a_loss_is_repaired_within_a_second_and_a_refresh_changes_nothing() {
     for frame in 0..100 {
         let colors = person.colors(0.05 * (frame as f32).min(60.0));
         for message in encoder.encode(stamp(frame), &colors) {
-            whole.take(&message).unwrap();
+            whole.ingest(&message).unwrap();
             if !(40..60).contains(&frame) || frame % 3 == 0 {
-                lossy.take(&message).unwrap();
+                lossy.ingest(&message).unwrap();
             }
             if frame >= 50 {
-                late.take(&message).unwrap();
+                late.ingest(&message).unwrap();
             }
         }
         if frame == 58 {
@@ -115,7 +115,7 @@ fn frames_keep_their_budget_and_catch_up() {
         // The rest of a budget may be shorter than the header of an empty message.
         assert!(bytes <= 6000 + 2 * 60, "{frame}: {bytes}");
         for message in messages {
-            decoder.take(&message).unwrap();
+            decoder.ingest(&message).unwrap();
         }
         errors.push(rms(&mut decoder, &encoded, &colors));
     }
@@ -131,7 +131,7 @@ fn an_encoder_that_begins_anew_is_followed() {
         let colors = person.colors(time);
         let mut encoder = ColorEncoder::new(&encoded, ColorSettings::default(), epoch);
         for message in encoder.encode(stamp(0), &colors) {
-            decoder.take(&message).unwrap();
+            decoder.ingest(&message).unwrap();
         }
         assert!(rms(&mut decoder, &encoded, &colors) < 5.0);
     }
@@ -148,7 +148,7 @@ fn colours_stay_until_an_encoder_that_begins_anew_has_sent_others() {
     };
     let whole = messages(8.0, 1);
     for message in whole {
-        decoder.take(&message).unwrap();
+        decoder.ingest(&message).unwrap();
     }
     let before = rms(&mut decoder, &encoded, &colors);
     // A message without any segment: nothing is known of the new encoder, and nothing turns grey.
@@ -156,16 +156,16 @@ fn colours_stay_until_an_encoder_that_begins_anew_has_sent_others() {
         let none = ColorSettings { step, max_frame_bytes: 0, ..ColorSettings::default() };
         ColorEncoder::new(&encoded, none, epoch).encode(stamp(1), &colors)
     };
-    decoder.take(&empty(8.0, 2)[0]).unwrap();
+    decoder.ingest(&empty(8.0, 2)[0]).unwrap();
     assert!(decoder.known(0) <= 0.0);
     assert!((rms(&mut decoder, &encoded, &colors) - before).abs() < 1e-9);
     for message in messages(8.0, 2) {
-        decoder.take(&message).unwrap();
+        decoder.ingest(&message).unwrap();
     }
     assert_eq!((decoder.known(0), decoder.known(2)), (1.0, 1.0));
     assert!((rms(&mut decoder, &encoded, &colors) - before).abs() < 1e-9);
     // Of other steps the old numbers mean something else.
-    decoder.take(&empty(4.0, 3)[0]).unwrap();
+    decoder.ingest(&empty(4.0, 3)[0]).unwrap();
     assert!(rms(&mut decoder, &encoded, &colors) > 3.0 * before);
 }
 
@@ -182,7 +182,7 @@ fn poisoned_colours_and_sizes_are_no_panic() {
         for colors in [vec![[f32::NAN; 4]; count], vec![[f32::INFINITY; 4]; count], vec![[-1e30; 4]; count], Vec::new()]
         {
             for message in encoder.encode(stamp(0), &colors) {
-                decoder.take(&message).unwrap();
+                decoder.ingest(&message).unwrap();
             }
             decoder.colors(&mut found);
             assert!(found.iter().flatten().all(|v| (0.0..=1.0).contains(v)), "{count}");
@@ -200,7 +200,7 @@ fn damaged_messages_are_no_panic() {
     for message in encoder.encode(stamp(0), &person.colors(0.0)) {
         damaged(&message, 1500, |bytes| {
             // Refused or not: it goes on.
-            let _ = decoder.take(bytes);
+            let _ = decoder.ingest(bytes);
             decoder.colors(&mut found);
             assert!(found.iter().flatten().all(|v| (0.0..=1.0).contains(v)));
         });
@@ -219,7 +219,7 @@ fn what_is_played_again_is_as_new() {
         for message in &messages {
             let mut message = message.clone();
             restamp(&mut message, -5 - i64::from(round), round).unwrap();
-            let taken = decoder.take(&message).unwrap();
+            let taken = decoder.ingest(&message).unwrap();
             assert_eq!((taken.capture_nanos, taken.frame), (-5 - i64::from(round), 3));
             assert_eq!(stamp_of(&message).unwrap(), taken);
         }

@@ -1,44 +1,46 @@
 //! Colours: changes of quantised Haar coefficients from frame to frame, in layers from coarse to fine.
 //!
-//! Encoder and decoder keep the coefficients in whole steps. A message changes some segments of the surface, each either by
-//! the difference from the encoder's last state or by the state itself (a refresh, after which a decoder is right whatever it
-//! missed). Every segment is refreshed once in [`ColorSettings::refresh_secs`]; the refresh of a segment that a decoder followed changes
-//! nothing, so it cannot be seen. A decoder that misses a message errs by the changes of that message alone.
+//! Encoder and decoder keep the coefficients in whole quantisation steps. A message changes some segments of the surface, each either by
+//! the difference from the encoder's last state or by the state itself (a refresh, which corrects a decoder whatever it missed). Every
+//! segment is refreshed once per [`ColorSettings::refresh_secs`]; for a decoder that missed nothing a refresh changes nothing, so it is
+//! invisible. The error of a decoder that misses a message is limited to the changes of that message.
 //!
-//! A message ends where its bytes do: the remaining segments wait for the next frame.
+//! A message ends at its byte budget: the remaining segments wait for the next frame.
 
 use alloc::{vec, vec::Vec};
 use core::ops::Range;
 
 use crate::{
-    EncodedTemplate, MAX_MESSAGE_BYTES, Stamp, StreamError, StreamTemplate,
     bytes::Fields,
     coefficients::{CoefficientModel, GROUP, Levels},
+    error::StreamError,
     integers::MOST,
+    message::{COLOR_MAGIC, MAX_MESSAGE_BYTES},
     quantise::quantise,
     range_coder::{BitCoder, Probability, RangeDecoder, RangeEncoder},
     srgb::Srgb,
+    stamp::Stamp,
+    template::{EncodedTemplate, StreamTemplate},
     tree::{CHANNELS, HaarTree, Steps},
 };
 
-/// Layers, from coarse to fine: a viewer can show any number of the first ones.
+/// Number of layers, from coarse to fine: a viewer can show any number of the first ones.
 pub const LAYERS: usize = 3;
 
-pub(crate) const MAGIC: [u8; 3] = *b"FLC";
 const WHAT: &str = "colour message";
-/// Step of the two colour differences against that of the brightness.
+/// Quantisation step of the two colour differences relative to that of the brightness.
 const CHROMA: f32 = 1.8;
-/// Changes below `1 - ROUND_UP` of a step count as none.
+/// Rounding offset: changes below `1 - ROUND_UP` of a step count as none.
 const ROUND_UP: f32 = 0.3;
 
-/// How colours are coded.
+/// Settings of a [`ColorEncoder`].
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct ColorSettings {
     /// Quantisation step of the brightness, codes of 0..=255 sRGB.
     pub step: f32,
-    /// Within this time every segment is refreshed, seconds.
+    /// Time within which every segment is refreshed, seconds.
     pub refresh_secs: f32,
-    /// Most bytes of a frame in all layers: what a person who is new, or an encoder that begins anew, sends at most.
+    /// Byte budget of a frame over all layers, which a new person, or an encoder that restarts, reaches.
     pub max_frame_bytes: usize,
 }
 
@@ -48,7 +50,7 @@ impl Default for ColorSettings {
     }
 }
 
-/// Levels of a layer: the finest three belong to the last layer, the next three to the one before.
+/// Returns the levels of a layer: the finest three belong to the last layer, the next three to the one before.
 fn layer_levels(tree: &HaarTree, layer: usize) -> Range<u32> {
     let all = tree.levels();
     let end = |layer: usize| all.end.saturating_sub((LAYERS - 1 - layer) as u32 * GROUP).max(all.start);
@@ -56,7 +58,7 @@ fn layer_levels(tree: &HaarTree, layer: usize) -> Range<u32> {
     start..end(layer)
 }
 
-/// The groups of a layer's levels, the last one full.
+/// Returns the groups of a layer's levels, the last one full.
 fn groups(levels: Range<u32>) -> impl Iterator<Item = Range<u32>> {
     let count = (levels.end - levels.start).div_ceil(GROUP);
     (0..count).rev().map(move |i| {
@@ -69,12 +71,12 @@ fn groups(levels: Range<u32>) -> impl Iterator<Item = Range<u32>> {
 #[derive(Debug, Clone, Copy, Default)]
 struct Model {
     is_refresh: Probability,
-    /// Differences and states look different.
+    /// Models of differences and of states, whose statistics differ.
     coefficients: [CoefficientModel; 2],
 }
 
 impl Model {
-    /// Codes a segment's part of a layer.
+    /// Codes the part of a layer in a segment; returns whether it is a refresh.
     fn code(
         &mut self,
         coder: &mut impl BitCoder,
@@ -105,23 +107,24 @@ fn each_level(tree: &HaarTree, steps: &Steps, layer: usize, segment: usize, mut 
     }
 }
 
-/// Codes brightness and two colour differences.
+/// Converts sRGB codes to brightness and two colour differences.
 fn differences_of([r, g, b]: [f32; 3]) -> [f32; CHANNELS] {
     [0.25 * (r + 2.0 * g + b), (r - b) / CHROMA, (g - 0.5 * (r + b)) / CHROMA]
 }
 
+/// Converts brightness and colour differences to sRGB codes.
 fn color_of([y, red_blue, green]: [f32; CHANNELS]) -> [f32; 3] {
     let (red_blue, green) = (red_blue * CHROMA, green * CHROMA);
     let others = y - 0.5 * green;
     [others + 0.5 * red_blue, y + 0.5 * green, others - 0.5 * red_blue]
 }
 
-/// Encodes the colours of one template, frame after frame.
+/// Encoder of the colours of one template, frame after frame.
 #[derive(Debug, Clone)]
 pub struct ColorEncoder {
     template: u64,
     settings: ColorSettings,
-    /// Tells decoders that the states begin anew.
+    /// Number of this encoder, by which decoders notice that the states restart.
     epoch: u32,
     order: Vec<u32>,
     tree: HaarTree,
@@ -130,7 +133,7 @@ pub struct ColorEncoder {
     state: Vec<Levels>,
     changes: Vec<Levels>,
     layers: [LayerState; LAYERS],
-    /// Capture time of the message before.
+    /// Capture time of the previous message.
     last_nanos: Option<i64>,
     coefficients: Vec<[f32; 3]>,
     means: Vec<[f32; 3]>,
@@ -139,17 +142,17 @@ pub struct ColorEncoder {
 #[derive(Debug, Clone)]
 struct LayerState {
     sequence: u32,
-    /// Segment that is coded first in the next message.
+    /// First segment of the next message.
     first: usize,
-    /// Whether the decoders can know a segment.
+    /// Whether each segment has been sent.
     is_known: Vec<bool>,
-    /// Segment that is refreshed next, and how many are due.
+    /// Next segment to refresh, and number of refreshes that are due.
     next_refresh: usize,
     due: f32,
 }
 
 impl ColorEncoder {
-    /// For a template. `epoch` must differ from that of an earlier encoder of the same person and template.
+    /// Creates an encoder for a template. `epoch` must differ from that of an earlier encoder of the same person and template.
     #[must_use]
     pub fn new(template: &EncodedTemplate, settings: ColorSettings, epoch: u32) -> Self {
         let tree = HaarTree::new(template.template.gaussians());
@@ -177,8 +180,8 @@ impl ColorEncoder {
         }
     }
 
-    /// Encodes the linear colours of a frame, in the order of the template's source: a message a layer. A colour that is missing
-    /// or not finite counts as black.
+    /// Encodes the linear colours of a frame, in the order of the template's source, as one message per layer. A colour that is missing or
+    /// not finite counts as black.
     pub fn encode(&mut self, stamp: Stamp, colors: &[[f32; 4]]) -> [Vec<u8>; LAYERS] {
         let stamp = Stamp { template: self.template, ..stamp };
         let item = |i: usize| {
@@ -201,7 +204,7 @@ impl ColorEncoder {
     fn encode_layer(&mut self, stamp: Stamp, layer: usize, max_bytes: usize) -> Vec<u8> {
         let segments = self.tree.segments();
         let LayerState { sequence, first, .. } = self.layers[layer];
-        let mut bytes = stamp.begin(MAGIC);
+        let mut bytes = stamp.begin(COLOR_MAGIC);
         bytes.extend(self.epoch.to_le_bytes());
         bytes.extend(self.settings.step.to_le_bytes());
         bytes.extend(sequence.to_le_bytes());
@@ -240,7 +243,7 @@ impl ColorEncoder {
         }
         let layer = &mut self.layers[layer];
         layer.sequence = layer.sequence.wrapping_add(1);
-        // Where it broke off the next message begins; a complete one begins anywhere.
+        // The next message begins where this one broke off.
         layer.first = (first + count) % segments;
         // Refreshes that did not fit stay due.
         let coded = |segment: usize| (segment + segments - first) % segments < count;
@@ -255,17 +258,17 @@ impl ColorEncoder {
     }
 }
 
-/// Writes the changes in whole steps, or for a refresh the new states, that bring the old states to the values.
+/// Computes the changes in whole steps that bring the old states to the values, or for a refresh the new states.
 fn change(values: &[f32], old: &[i32], per_step: f32, is_refresh: bool, changes: &mut [i32]) {
     for ((change, value), &old) in changes.iter_mut().zip(values).zip(old) {
         let by = quantise(value * per_step - old as f32, ROUND_UP);
-        // States are at most MOST, so that nothing wraps; a check at each number would cost more than all of this.
+        // States are at most MOST, so nothing wraps; checks of each number would cost more than the whole loop.
         let new = old.wrapping_add(by).clamp(-MOST, MOST);
         *change = if is_refresh { new } else { new.wrapping_sub(old).clamp(-MOST, MOST) };
     }
 }
 
-/// Adds changes to states, or for a refresh puts them in their place.
+/// Adds changes to states, or replaces the states for a refresh.
 fn add(changes: &[Levels], is_refresh: bool, state: &mut [Levels]) {
     if is_refresh {
         return state.copy_from_slice(changes);
@@ -275,7 +278,7 @@ fn add(changes: &[Levels], is_refresh: bool, state: &mut [Levels]) {
     }
 }
 
-/// Decodes the colours of one person and template.
+/// Decoder of the colours of one person and template.
 #[derive(Debug, Clone)]
 pub struct ColorDecoder {
     template: u64,
@@ -287,7 +290,7 @@ pub struct ColorDecoder {
     state: Vec<Levels>,
     values: Vec<Levels>,
     layers: [DecodedLayer; LAYERS],
-    /// Segments of the coarsest layer that have come since the steps were these, from an earlier encoder as well.
+    /// Whether each segment of the coarsest layer has arrived with these steps, from an earlier encoder as well.
     is_shown: Vec<bool>,
     means: Vec<[f32; 3]>,
 }
@@ -300,7 +303,7 @@ struct DecodedLayer {
 }
 
 impl ColorDecoder {
-    /// For a template, all grey.
+    /// Creates a decoder for a template; all colours are grey.
     #[must_use]
     pub fn new(template: &StreamTemplate) -> Self {
         let tree = HaarTree::new(template.gaussians());
@@ -320,12 +323,12 @@ impl ColorDecoder {
         }
     }
 
-    /// Takes in a message and returns its stamp.
+    /// Ingests a message and returns its stamp.
     ///
     /// # Errors
     /// [`StreamError`]; a message of another template changes nothing.
-    pub fn take(&mut self, bytes: &[u8]) -> Result<Stamp, StreamError> {
-        let mut fields = Fields::of(WHAT, MAGIC, bytes)?;
+    pub fn ingest(&mut self, bytes: &[u8]) -> Result<Stamp, StreamError> {
+        let mut fields = Fields::new(WHAT, COLOR_MAGIC, bytes)?;
         fields.check(bytes.len() <= MAX_MESSAGE_BYTES, "it is too large")?;
         let stamp = Stamp::read(&mut fields)?;
         if stamp.template != self.template {
@@ -337,7 +340,7 @@ impl ColorDecoder {
         fields.check((0.25..=128.0).contains(&step), "its quantisation step makes no sense")?;
         fields.check(layer < LAYERS && first < segments && count <= segments, "it names a part that does not exist")?;
         if self.epoch != Some(epoch) || self.step.to_bits() != step.to_bits() {
-            self.begin(epoch, step);
+            self.restart(epoch, step);
         }
         let known = &mut self.layers[layer];
         let next = known.sequence.map_or(sequence, |last| last.wrapping_add(1));
@@ -362,8 +365,8 @@ impl ColorDecoder {
         Ok(stamp)
     }
 
-    /// The encoder began anew. Colours of the one before are shown until others come.
-    fn begin(&mut self, epoch: u32, step: f32) {
+    /// Follows an encoder that restarted. The colours of the previous one are shown until new ones arrive.
+    fn restart(&mut self, epoch: u32, step: f32) {
         if self.step.to_bits() != step.to_bits() {
             self.steps = self.tree.steps(step);
             self.state.fill([0; CHANNELS]);
@@ -376,13 +379,13 @@ impl ColorDecoder {
         }
     }
 
-    /// Counts the messages of a layer that were missed since the start.
+    /// Returns the number of missed messages of a layer since the start.
     #[must_use]
     pub fn missed(&self, layer: usize) -> u64 {
         self.layers.get(layer).map_or(0, |layer| layer.missed)
     }
 
-    /// Returns the share of a layer's segments that have come, 0..=1.
+    /// Returns the fraction of a layer's segments that have arrived, 0..=1.
     #[must_use]
     pub fn known(&self, layer: usize) -> f32 {
         self.layers.get(layer).map_or(0.0, |layer| {
@@ -390,7 +393,7 @@ impl ColorDecoder {
         })
     }
 
-    /// Writes the linear colours, opacity 1, in the template's order. Segments that have not come yet are grey.
+    /// Computes the linear colours, opacity 1, in the template's order. Segments that have not arrived yet are grey.
     pub fn colors(&mut self, colors: &mut Vec<[f32; 4]>) {
         colors.resize(self.tree.items(), [0.0; 4]);
         let (state, base, mean_step) = (&self.state, &self.is_shown, self.steps.mean);

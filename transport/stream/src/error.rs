@@ -1,30 +1,32 @@
-//! Why a message is refused.
+//! Errors of the codec.
 
 use core::fmt;
 
-/// Why something cannot be encoded or decoded.
+use crate::message::CODEC_VERSION;
+
+/// Error of encoding or decoding a message of the person stream.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub enum StreamError {
-    /// Written by a program with another form of the codec.
+    /// Message of a program with another version of the codec.
     Version {
-        /// The message.
+        /// Name of the message.
         what: &'static str,
-        /// Its version.
+        /// Version of the message.
         found: u8,
     },
-    /// Damaged, or not such a message.
+    /// Damaged message, or one of another kind.
     Malformed {
-        /// The message.
+        /// Name of the message.
         what: &'static str,
-        /// The fault.
+        /// Fault.
         problem: &'static str,
     },
-    /// Belongs to another template than the decoder's.
+    /// Message of another template than the decoder's.
     OtherTemplate {
-        /// The message.
+        /// Name of the message.
         what: &'static str,
     },
-    /// A template that cannot be made.
+    /// Template that cannot be encoded.
     Template(&'static str),
 }
 
@@ -33,9 +35,8 @@ impl fmt::Display for StreamError {
         match self {
             Self::Version { what, found } => write!(
                 f,
-                "the {what} has version {found} of the person stream, this program reads version {}; update the older of the two \
-                 programs",
-                crate::CODEC_VERSION
+                "the {what} has version {found} of the person stream, this program reads version {CODEC_VERSION}; update the older of the two \
+                 programs"
             ),
             Self::Malformed { what, problem } => write!(f, "the {what} is damaged: {problem}"),
             Self::OtherTemplate { what } => write!(f, "the {what} belongs to another template"),

@@ -1,14 +1,14 @@
-//! Models of integers.
+//! Adaptive models of integers.
 
 use crate::range_coder::{BitCoder, Probability};
 
 /// Largest magnitude of a coded value.
 pub(crate) const MOST: i32 = 1 << 20;
 
-/// Steps of a magnitude that have a probability of their own.
+/// Number of steps of a magnitude with a probability of their own.
 const STEPS: usize = 14;
 
-/// Magnitudes of values that are not zero: steps up from 1 while small, then an Elias gamma code.
+/// Model of values that are not zero: unary steps from 1 for small magnitudes, then an Elias gamma code.
 #[derive(Debug, Clone, Copy, Default)]
 pub(crate) struct MagnitudeModel([Probability; STEPS]);
 
@@ -29,22 +29,22 @@ impl MagnitudeModel {
     }
 }
 
-/// Steps of a residual's upper part that have a probability of their own.
+/// Number of steps of a residual's upper part with a probability of their own.
 const UPPER_STEPS: usize = 12;
-/// Sizes that are expected, two to each doubling.
+/// Number of expected sizes, two per doubling.
 const SIZES: usize = 32;
 /// Largest magnitude of a residual.
 const MOST_RESIDUAL: i32 = 4 * MOST;
 
-/// Differences from a prediction, by the size that is expected: what remains of their magnitude after division by that size takes steps up
-/// from 0, as in a Golomb code whose decisions adapt.
+/// Model of differences from a prediction, selected by their expected size: the quotient of magnitude and size takes unary steps from 0,
+/// as in a Golomb code with adaptive decisions.
 #[derive(Debug, Clone, Copy, Default)]
 pub(crate) struct ResidualModel([(MagnitudeSteps, Probability); SIZES]);
 
 type MagnitudeSteps = [Probability; UPPER_STEPS];
 
 impl ResidualModel {
-    /// Codes a value of at most [`MOST_RESIDUAL`]; `expected` is four times the magnitude that is expected.
+    /// Codes a value of magnitude at most [`MOST_RESIDUAL`]; `expected` is four times the expected magnitude.
     pub fn code(&mut self, coder: &mut impl BitCoder, value: i32, expected: u32) -> i32 {
         let expected = expected.max(1);
         let doublings = expected.ilog2();
@@ -73,7 +73,7 @@ impl ResidualModel {
     }
 }
 
-/// Elias gamma code of `value + 1`, for values below 2^23.
+/// Codes `value + 1` as Elias gamma, for values below 2^23.
 fn gamma(coder: &mut impl BitCoder, value: u32) -> u32 {
     let bits = (value + 1).ilog2();
     let mut found = 0;
@@ -84,8 +84,7 @@ fn gamma(coder: &mut impl BitCoder, value: u32) -> u32 {
     (1 << found | below) - 1
 }
 
-/// Numbers of any size below 2^24: their length as a tree of adaptive decisions, then their upper two bits with a model
-/// and the rest without.
+/// Model of numbers below 2^24: their length as a tree of adaptive decisions, then two bits with a model and the rest without.
 #[derive(Debug, Clone, Default)]
 pub(crate) struct NumberModel {
     length: [Probability; 32],
@@ -104,7 +103,7 @@ impl NumberModel {
         if length < 2 {
             return length;
         }
-        // Behind the leading 1: two bits with a model, then the rest.
+        // After the leading 1: two bits with a model, then the rest.
         let mut found = 1;
         let modelled = (length - 1).min(2);
         let mut node = 1;

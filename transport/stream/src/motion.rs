@@ -1,38 +1,40 @@
-//! Motion: pose and node translations of one frame, readable without any other frame.
+//! Motion: pose and node translations of one frame, decodable without any other frame.
 
 use alloc::{vec, vec::Vec};
 
 use crate::{
-    EncodedTemplate, MAX_MESSAGE_BYTES, Stamp, StreamError, StreamTemplate,
     bytes::Fields,
+    error::StreamError,
+    message::{MAX_MESSAGE_BYTES, MOTION_MAGIC},
     nodes::{Prediction, code_nodes},
     quantise::quantise,
     range_coder::{RangeDecoder, RangeEncoder},
+    stamp::Stamp,
+    template::{EncodedTemplate, StreamTemplate},
 };
 
-pub(crate) const MAGIC: [u8; 3] = *b"FLM";
 const WHAT: &str = "motion";
-/// Step of node translations, metres: an error of 0.12 mm.
+/// Quantisation step of node translations, metres: an error of 0.12 mm.
 const NODE_STEP_M: f32 = 4e-4;
-/// Step of the root's translation, metres.
+/// Quantisation step of the root's translation, metres.
 const ROOT_STEP_M: f64 = 1e-4;
-/// Steps of a quaternion's component, of 1/sqrt(2) to either side.
+/// Quantisation steps of a quaternion's component to either side of 0, whose range is 1/sqrt(2).
 const QUATERNION_LEVELS: f32 = 16_383.0;
 
-/// Where a person is, and in which pose.
+/// Pose and position of a person at one frame.
 #[derive(Debug, Clone, PartialEq, Default)]
 pub struct Motion {
-    /// Which template, person and frame.
+    /// Template, person and frame.
     pub stamp: Stamp,
     /// Position of the root joint in the world, metres.
     pub root_translation: [f32; 3],
-    /// Rotation of each joint against its parent (of the root: against the world), a unit quaternion x, y, z, w.
+    /// Rotation of each joint relative to its parent (the root's: to the world), a unit quaternion x, y, z, w.
     pub joint_rotations: Vec<[f32; 4]>,
     /// Translation of each node in canonical space, metres; empty without a deformation graph.
     pub nodes: Vec<[f32; 3]>,
 }
 
-/// Encodes the motion of one template.
+/// Encoder of the motion of one template.
 #[derive(Debug, Clone)]
 pub struct MotionEncoder {
     template: u64,
@@ -43,7 +45,7 @@ pub struct MotionEncoder {
 }
 
 impl MotionEncoder {
-    /// For a template.
+    /// Creates an encoder for a template.
     #[must_use]
     pub fn new(template: &EncodedTemplate) -> Self {
         Self {
@@ -55,8 +57,8 @@ impl MotionEncoder {
         }
     }
 
-    /// Encodes a motion whose nodes are in the order of the template's source; those that are missing or not finite count as at
-    /// rest. `motion.stamp.template` is replaced by the template's.
+    /// Encodes a motion whose nodes are in the order of the template's source; nodes that are missing or not finite count as at rest.
+    /// `motion.stamp.template` is replaced by the hash of the template.
     ///
     /// # Errors
     /// [`StreamError::Malformed`] when joints are missing or a number of the pose is not finite.
@@ -69,7 +71,7 @@ impl MotionEncoder {
         if !root.iter().all(|v| v.abs() < f64::from(i32::MAX)) {
             return fail("the root's position is not finite");
         }
-        let mut bytes = Stamp { template: self.template, ..motion.stamp }.begin(MAGIC);
+        let mut bytes = Stamp { template: self.template, ..motion.stamp }.begin(MOTION_MAGIC);
         bytes.extend(root.iter().flat_map(|v| (*v as i32).to_le_bytes()));
         for rotation in &motion.joint_rotations {
             let Some(packed) = pack(*rotation) else { return fail("a rotation is not of unit length") };
@@ -94,12 +96,12 @@ impl MotionEncoder {
 }
 
 impl Motion {
-    /// Reads a motion of this template.
+    /// Decodes a motion of this template.
     ///
     /// # Errors
-    /// [`StreamError`].
+    /// [`StreamError`] for damaged bytes, and for a motion of another version or template.
     pub fn decode(bytes: &[u8], template: &StreamTemplate) -> Result<Self, StreamError> {
-        let mut fields = Fields::of(WHAT, MAGIC, bytes)?;
+        let mut fields = Fields::new(WHAT, MOTION_MAGIC, bytes)?;
         fields.check(bytes.len() <= MAX_MESSAGE_BYTES, "it is too large")?;
         let stamp = Stamp::read(&mut fields)?;
         if stamp.template != template.hash {
@@ -120,8 +122,8 @@ impl Motion {
         Ok(Self { stamp, root_translation, joint_rotations, nodes })
     }
 
-    /// Between two motions of one template, `t` in 0..=1: along the shortest turn of each joint. The stamp is that of the
-    /// nearer one, with the capture time in between.
+    /// Interpolates between two motions of one template, `t` in 0..=1, along the shortest rotation of each joint. The stamp is that of the
+    /// nearer motion, with the capture time in between.
     #[must_use]
     pub fn interpolate(&self, other: &Self, t: f32) -> Self {
         let mix = |a: f32, b: f32| a + (b - a) * t;
@@ -150,7 +152,7 @@ impl Motion {
     }
 }
 
-/// A rotation in 47 bits: which component is largest, and the three others. None when it is not of unit length.
+/// Packs a rotation into 47 bits: the index of the largest component and the other three. `None` when it is not of unit length.
 fn pack(rotation: [f32; 4]) -> Option<u64> {
     let length = libm::sqrtf(rotation.iter().map(|v| v * v).sum());
     if !(0.9..1.1).contains(&length) {
@@ -166,6 +168,7 @@ fn pack(rotation: [f32; 4]) -> Option<u64> {
     Some(packed)
 }
 
+/// Unpacks a rotation.
 fn unpack(packed: u64) -> [f32; 4] {
     let largest = (packed >> 45 & 3) as usize;
     let mut rotation = [0.0; 4];
@@ -177,7 +180,7 @@ fn unpack(packed: u64) -> [f32; 4] {
         rotation[k] = share;
     }
     rotation[largest] = libm::sqrtf((1.0f32 - squares).max(0.0));
-    // Damaged bits can hold three that are too large.
+    // In damaged bits, the three may be too large.
     let by = 1.0 / libm::sqrtf(squares.max(1.0));
     rotation.map(|v| v * by)
 }

@@ -1,4 +1,4 @@
-//! Translations of the deformation graph's nodes in whole steps: each is predicted from nodes around it that come before it.
+//! Coding of the node translations of the deformation graph, in whole steps: each is predicted from neighbours coded before it.
 
 use alloc::{vec, vec::Vec};
 
@@ -9,29 +9,29 @@ use crate::{
     tree::CHANNELS,
 };
 
-/// Nodes that a node is predicted from.
+/// Largest number of nodes that a node is predicted from.
 const NEAREST: usize = 3;
-/// Length of a unit normal beside positions, metres: front and back of a thin part move apart.
+/// Weight of a unit normal in distances, metres: front and back of a thin part move separately.
 const NORMAL_M: f32 = 0.1;
 /// Least squared distance between two nodes, square metres.
 const LEAST_SQUARED: f32 = 1e-8;
-/// Bits of a share.
+/// Fractional bits of a share.
 const SHARE_BITS: u32 = 16;
-/// Weight of a node's own channels beside those of the nodes around it, where the size of a difference is expected.
+/// Weight of a node's own channels relative to those of its neighbours in the expected size of a difference.
 const OWN: u32 = 4;
 
-/// Nodes that a node is predicted from, with their shares in steps of `2^-SHARE_BITS`; those of no share are unused.
+/// Nodes that a node is predicted from, with their shares in steps of `2^-SHARE_BITS`; nodes without a share are unused.
 #[derive(Debug, Clone, Copy, Default, PartialEq)]
 pub(crate) struct Prediction {
     node: [u32; NEAREST],
     share: [i32; NEAREST],
 }
 
-/// Chooses what each node is predicted from: of the nodes before it that move a Gaussian together with it, so that the surface joins
-/// them, the nearest, weighted by inverse squared distances (Shepard 1968); where there is none, the node before it. `places` (metres) and
-/// `normals` have an element a node, `influences` one a Gaussian.
+/// Chooses the nodes that each node is predicted from: the nearest of those before it that move a Gaussian together with it, and so are
+/// joined to it by the surface, weighted by inverse squared distances (Shepard 1968); where there is none, the node before it. `places`
+/// (metres) and `normals` have one element per node, `influences` one per Gaussian.
 ///
-/// The same on every computer: no operation but those that IEEE 754 rounds.
+/// The result is the same on every computer: it only takes operations that IEEE 754 rounds correctly.
 pub(crate) fn predictions(places: &[[f32; 3]], normals: &[[f32; 3]], influences: &[Influences]) -> Vec<Prediction> {
     let squared = |a: usize, b: usize| {
         let apart = |v: &[[f32; 3]]| (0..3).map(|k| (v[a][k] - v[b][k]) * (v[a][k] - v[b][k])).sum::<f32>();
@@ -64,7 +64,7 @@ pub(crate) fn predictions(places: &[[f32; 3]], normals: &[[f32; 3]], influences:
     nearest.into_iter().enumerate().map(predict).collect()
 }
 
-/// Enters a squared distance and a node among the nearest, unless it is there.
+/// Inserts a squared distance and a node among the nearest, unless it is one of them.
 fn insert(nearest: &mut [(f32, u32); NEAREST], new: (f32, u32)) {
     if nearest.contains(&new) {
         return;
@@ -108,7 +108,7 @@ mod tests {
     use super::*;
     use crate::range_coder::{RangeDecoder, RangeEncoder};
 
-    /// Nodes on a sheet, row by row, and Gaussians that hang on four neighbours each.
+    /// Returns nodes on a sheet, row by row, and Gaussians that hang on four neighbours each.
     fn sheet(side: usize) -> (Vec<[f32; 3]>, Vec<[f32; 3]>, Vec<Influences>) {
         let place = |i: usize| [0.03 * (i % side) as f32, 0.03 * (i / side) as f32, 0.001 * (i * i % 7) as f32];
         let corners = |i: usize| [i, i + 1, i + side, i + side + 1].map(|i| i as u32);
@@ -129,7 +129,7 @@ mod tests {
         bytes
     }
 
-    /// The nearest of the nodes before one that share a Gaussian with it, by brute force in f64, with their shares of 1.
+    /// Returns the nearest of the nodes before one that share a Gaussian with it, by brute force in f64, with their shares.
     fn reference(node: usize, places: &[[f32; 3]], normals: &[[f32; 3]], influences: &[Influences]) -> Vec<(u32, f64)> {
         let hangs = |on: &Influences, node: usize| (0..4).any(|k| on.weight[k] > 0 && on.index[k] == node as i32);
         let apart = |v: &[[f32; 3]], other: usize| -> f64 {

@@ -1,12 +1,12 @@
-//! An order in which neighbours in space are neighbours in the list.
+//! Spatial order: neighbours in space are neighbours in the list.
 
 use alloc::vec::Vec;
 
-/// Length of a unit normal beside positions, metres: front and back of a thin part lie apart.
+/// Weight of a unit normal relative to positions, metres: front and back of a thin part are separate.
 const NORMAL_M: f32 = 0.1;
 
-/// Orders points so that each node of a [`crate::tree::HaarTree`] over the list is a compact part of them: halves by the median
-/// along the longest extent, down to single points. Returns the points' indices.
+/// Orders points so that each node of a [`crate::tree::HaarTree`] over the list is compact: splits at the median along the longest extent,
+/// down to single points. Returns the points' indices.
 pub(crate) fn spatial_order(points: &[[f32; 3]], normals: Option<&[[f32; 3]]>) -> Vec<u32> {
     let mut order: Vec<u32> = (0..points.len() as u32).collect();
     let mut parts = alloc::vec![&mut order[..]];

@@ -1,15 +1,15 @@
-//! Planes of a template: one attribute of all Gaussians, each coded by its difference from the Gaussian before.
+//! Attributes of a template's Gaussians, each coded as its difference from the previous Gaussian.
 
 use crate::{integers::NumberModel, range_coder::BitCoder};
 
-/// Levels of a coordinate, a normal's axis and a scale.
+/// Quantisation levels of a coordinate, an axis of a normal and a scale.
 pub(crate) const POSITION_LEVELS: f32 = 65_535.0;
 pub(crate) const NORMAL_LEVELS: f32 = 1023.0;
 pub(crate) const SCALE_LEVELS: f32 = 1023.0;
-/// Sum of a Gaussian's weights.
+/// Sum of the weights of a Gaussian.
 pub(crate) const WEIGHT_SUM: i32 = 255;
 
-/// A Gaussian of the template as it is coded.
+/// Quantised Gaussian of the template.
 #[derive(Debug, Clone, Copy, Default, PartialEq)]
 pub(crate) struct Quantised {
     pub position: [i32; 3],
@@ -19,7 +19,7 @@ pub(crate) struct Quantised {
     pub nodes: Influences,
 }
 
-/// Four influences by growing index; weights sum up to [`WEIGHT_SUM`].
+/// Four influences by increasing index, whose weights add up to [`WEIGHT_SUM`].
 #[derive(Debug, Clone, Copy, Default, PartialEq)]
 pub(crate) struct Influences {
     pub index: [i32; 4],
@@ -27,7 +27,7 @@ pub(crate) struct Influences {
 }
 
 impl Influences {
-    /// From indices and weights that are finite and not negative; influences of no weight point to the first.
+    /// Quantises indices and weights, which must be finite and not negative; influences without weight take the index of the heaviest.
     pub fn new(index: [u32; 4], weight: [f32; 4]) -> Self {
         let sum: f32 = weight.iter().sum();
         let share = |w: f32| if sum > 0.0 { w / sum * WEIGHT_SUM as f32 } else { 0.0 };
@@ -43,7 +43,7 @@ impl Influences {
         Self { index: pairs.map(|(i, _)| i), weight: pairs.map(|(_, w)| w) }
     }
 
-    /// Returns the same, those that have a weight first.
+    /// Returns the influences, those with a weight first.
     pub fn heavy_first(&self) -> Self {
         let mut found = Self::default();
         let order = (0..4).filter(|k| self.weight[*k] > 0).chain((0..4).filter(|k| self.weight[*k] <= 0));
@@ -53,14 +53,32 @@ impl Influences {
         found
     }
 
-    /// Returns indices and shares of 1 of those that have a weight, if they come first.
+    /// Returns indices and weights, as fractions, of the influences that have a weight; those must come first.
     pub fn shares(&self) -> impl Iterator<Item = (usize, f32)> {
         let pairs = self.index.into_iter().zip(self.weight).take_while(|(_, weight)| *weight > 0);
         pairs.map(|(index, weight)| (index as usize, weight as f32 * (1.0 / WEIGHT_SUM as f32)))
     }
 }
 
-/// Probabilities of all planes.
+/// Returns the sum of the squared distances between the nodes of a Gaussian that have a weight, square metres; those must come first.
+#[inline]
+pub(crate) fn spread(on: &Influences, place: impl Fn(usize) -> [f32; 3]) -> f32 {
+    // From the first of n nodes at distances d: n times the sum of |d|^2, less |sum of d|^2.
+    let first = place(on.index[0] as usize);
+    let (mut sum, mut squares, mut count) = ([0.0; 3], 0.0, 1.0);
+    for (node, _) in on.shares().skip(1) {
+        let other = place(node);
+        for k in 0..3 {
+            let apart = other[k] - first[k];
+            sum[k] += apart;
+            squares += apart * apart;
+        }
+        count += 1.0;
+    }
+    count * squares - sum.iter().map(|v| v * v).sum::<f32>()
+}
+
+/// Probabilities of all attributes.
 #[derive(Debug, Default)]
 pub(crate) struct GaussianModel {
     position: [NumberModel; 3],
@@ -77,7 +95,7 @@ struct InfluenceModel {
 }
 
 impl GaussianModel {
-    /// Codes a Gaussian by its difference from the one before. Decoded values may be any; the caller checks them.
+    /// Codes a Gaussian by its difference from the one before. Decoded values are arbitrary; the caller checks them.
     pub fn code(
         &mut self,
         coder: &mut impl BitCoder,
@@ -122,7 +140,7 @@ impl InfluenceModel {
     }
 }
 
-/// A unit normal on the octahedron, each axis in 0..=[`NORMAL_LEVELS`].
+/// Maps a unit normal to the octahedron, each axis in 0..=[`NORMAL_LEVELS`].
 pub(crate) fn octahedral(normal: [f32; 3]) -> [i32; 2] {
     let sum = normal.iter().map(|v| v.abs()).sum::<f32>().max(1e-12);
     let [x, y, z] = normal.map(|v| v / sum);
@@ -131,7 +149,7 @@ pub(crate) fn octahedral(normal: [f32; 3]) -> [i32; 2] {
     folded.map(|v| ((0.5 * v + 0.5) * NORMAL_LEVELS + 0.5) as i32)
 }
 
-/// The unit normal of a place on the octahedron.
+/// Returns the unit normal of a point on the octahedron.
 pub(crate) fn normal_of(octahedral: [i32; 2]) -> [f32; 3] {
     let [x, y] = octahedral.map(|v| v as f32 / NORMAL_LEVELS * 2.0 - 1.0);
     let z = 1.0 - x.abs() - y.abs();

@@ -4,9 +4,9 @@ use alloc::vec::Vec;
 
 use flyrig_model::{quaternion, stretch};
 
-use crate::{Motion, StreamTemplate, planes::Influences};
+use crate::{motion::Motion, planes::spread, template::StreamTemplate};
 
-/// Gaussians in the world; both lists have one element a Gaussian.
+/// Posed Gaussians in the world; both lists have one element per Gaussian.
 #[derive(Debug, Clone, Default, PartialEq)]
 pub struct Posed {
     /// Centre, metres, and standard deviation, metres.
@@ -15,7 +15,7 @@ pub struct Posed {
     pub normal: Vec<[f32; 4]>,
 }
 
-/// A node in canonical space.
+/// Node in canonical space.
 #[derive(Clone, Copy)]
 struct Node {
     /// Position, metres.
@@ -31,30 +31,12 @@ impl Node {
     }
 }
 
-/// Sum of the squared distances between the nodes of a Gaussian that have a weight, square metres; those must come first.
-#[inline]
-pub(crate) fn spread(on: &Influences, place: impl Fn(usize) -> [f32; 3]) -> f32 {
-    // From the first of n nodes at distances d: n times the sum of |d|^2, less |sum of d|^2.
-    let first = place(on.index[0] as usize);
-    let (mut sum, mut squares, mut count) = ([0.0; 3], 0.0, 1.0);
-    for (node, _) in on.shares().skip(1) {
-        let other = place(node);
-        for k in 0..3 {
-            let apart = other[k] - first[k];
-            sum[k] += apart;
-            squares += apart * apart;
-        }
-        count += 1.0;
-    }
-    count * squares - sum.iter().map(|v| v * v).sum::<f32>()
-}
-
-/// Three rows of an affine motion.
+/// Three rows of an affine transform.
 type Rows = [[f32; 4]; 3];
 
 impl StreamTemplate {
-    /// Poses the Gaussians: world = LBS(x + sum of w t) (FlyHuman Eq. 1 and 2). They grow where the surface around them is longer
-    /// than at rest. A motion that lacks joints or nodes leaves them at rest.
+    /// Poses the Gaussians: world = LBS(x + sum of w t) (FlyHuman Eq. 1 and 2). They grow where the surface around them is stretched. Joints
+    /// and nodes that the motion lacks stay at rest.
     pub fn pose(&self, motion: &Motion, posed: &mut Posed) {
         let matrices = self.world_from_canonical(motion);
         let nodes: Vec<Node> =
@@ -91,7 +73,7 @@ impl StreamTemplate {
         }
     }
 
-    /// Skinning matrices of all joints.
+    /// Returns the skinning matrices of all joints.
     pub(crate) fn world_from_canonical(&self, motion: &Motion) -> Vec<Rows> {
         let mut world: Vec<Rows> = Vec::with_capacity(self.joints.len());
         for (i, joint) in self.joints.iter().enumerate() {
@@ -106,7 +88,7 @@ impl StreamTemplate {
     }
 }
 
-/// Returns the rows of the rigid motion by a unit quaternion x, y, z, w and a translation.
+/// Returns the rigid transform of a unit quaternion x, y, z, w and a translation.
 fn rigid(rotation: [f32; 4], [tx, ty, tz]: [f32; 3]) -> Rows {
     let [[xx, xy, xz], [yx, yy, yz], [zx, zy, zz]] = quaternion::matrix(rotation);
     [[xx, xy, xz, tx], [yx, yy, yz, ty], [zx, zy, zz, tz]]

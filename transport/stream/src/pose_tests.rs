@@ -9,7 +9,7 @@ use crate::{
     testing::{Person, damaged},
 };
 
-/// LBS(x + sum of w t) in f64, by matrices of 4 x 4.
+/// Computes LBS(x + sum of w t) in f64, by matrices of 4 x 4.
 fn reference(person: &Person, motion: &Motion) -> Vec<[f64; 3]> {
     type Matrix = [[f64; 4]; 4];
     let product = |a: &Matrix, b: &Matrix| -> Matrix {
@@ -68,7 +68,7 @@ fn reference(person: &Person, motion: &Motion) -> Vec<[f64; 3]> {
         .collect()
 }
 
-/// Growth of a Gaussian in f64: distances between its nodes over those at rest, as roots of the mean square.
+/// Returns the growth of a Gaussian in f64: distances between its nodes over those at rest, as roots of the mean square.
 fn growth(template: &StreamTemplate, motion: &Motion, gaussian: usize) -> f64 {
     let Some(nodes) = template.node_weights.get(gaussian) else { return 1.0 };
     let mut squares = [0.0; 2];

@@ -2,9 +2,10 @@
 
 use crate::integers::MOST;
 
-/// Returns the nearest level of a value in steps, at most [`MOST`] in magnitude; values up to `1 - round_up` beyond a level fall to it, NaN to 0.
+/// Returns the level of a value in steps, at most [`MOST`] in magnitude; values less than `1 - round_up` beyond a level round down to it,
+/// NaN to 0.
 ///
-/// No branch and no check of an overflow that cannot happen, so that a loop over it is compiled to vectors.
+/// It has no branch and no check of an impossible overflow, so that loops over it are vectorised.
 #[inline]
 pub(crate) fn quantise(value: f32, round_up: f32) -> i32 {
     // The cast saturates, and takes NaN to 0.

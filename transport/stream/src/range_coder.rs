@@ -4,12 +4,12 @@
 
 use alloc::vec::Vec;
 
-/// Probability of a `false`, learnt from the decisions so far.
+/// Probability of `false`, learnt from the decisions so far.
 #[derive(Debug, Clone, Copy)]
 pub(crate) struct Probability {
-    /// Adapts within some 16 decisions.
+    /// Mean over about 16 decisions.
     fast: u16,
-    /// Adapts within some 128 decisions.
+    /// Mean over about 128 decisions.
     slow: u16,
 }
 
@@ -21,11 +21,11 @@ impl Default for Probability {
 
 const FAST: u16 = 4;
 const SLOW: u16 = 7;
-/// Bits of a probability as the coders see it.
+/// Bits of a probability in the coders.
 const BITS: u32 = 15;
 
 impl Probability {
-    /// Of a `false`, in 1..2^15: both means stay off the ends by the rounding of their shifts.
+    /// Returns the probability of `false`, in 1..2^15: the rounding of the shifts keeps both means off the ends.
     fn of_false(self) -> u32 {
         (u32::from(self.fast) + u32::from(self.slow)) >> 2
     }
@@ -41,35 +41,43 @@ impl Probability {
     }
 }
 
-/// Codes decisions in one direction. Code that is generic over it describes a format once, for writing and for reading.
+/// Coder of decisions in one direction. Generic code describes a format once for writing and reading.
 pub(crate) trait BitCoder {
-    /// Whether it writes: what is read is then known already.
+    /// Whether the coder writes: values are then known already.
     const WRITES: bool;
 
-    /// Codes a decision: writes `bit` and returns it, or ignores it and returns what was written.
-    fn bit(&mut self, probability: &mut Probability, bit: bool) -> bool;
+    /// Codes a decision: writes `bit` and returns it, or ignores it and returns the written one.
+    #[inline]
+    fn bit(&mut self, probability: &mut Probability, bit: bool) -> bool {
+        let bit = self.divide(probability.of_false(), bit);
+        probability.adapt(bit);
+        bit
+    }
+
+    /// Narrows the range to one side of a decision, by the probability of `false` in 1..2^15; returns the decision.
+    fn divide(&mut self, of_false: u32, bit: bool) -> bool;
 
     /// Codes the lowest `count` (at most 24) bits of a number without a model.
     fn raw(&mut self, count: u32, bits: u32) -> u32;
 }
 
-/// Ranges below this are scaled up.
+/// Range below which the coders scale up.
 const LEAST_RANGE: u32 = 1 << 24;
 
-/// Writes.
+/// Writing coder.
 #[derive(Debug, Clone)]
 pub(crate) struct RangeEncoder {
     low: u64,
     range: u32,
-    /// The byte that a carry may still change, and how many bytes of 255 follow it.
+    /// Byte that a carry may still change, and number of bytes of 255 that follow it.
     cache: u8,
     waiting: usize,
     bytes: Vec<u8>,
-    /// Where the coded bytes begin.
+    /// Index of the first coded byte.
     start: usize,
 }
 
-/// How far an encoder had come.
+/// Position of an encoder.
 #[derive(Debug, Clone, Copy)]
 pub(crate) struct Mark {
     low: u64,
@@ -80,7 +88,7 @@ pub(crate) struct Mark {
 }
 
 impl RangeEncoder {
-    /// Writes behind `bytes`.
+    /// Creates a coder that appends to `bytes`.
     pub fn new(bytes: Vec<u8>) -> Self {
         Self { low: 0, range: u32::MAX, cache: 0, waiting: 0, start: bytes.len(), bytes }
     }
@@ -90,20 +98,20 @@ impl RangeEncoder {
         self.bytes.len() + self.waiting + 6
     }
 
-    /// Remembers this point.
+    /// Returns the present position.
     pub fn mark(&self) -> Mark {
         let Self { low, range, cache, waiting, ref bytes, .. } = *self;
         Mark { low, range, cache, waiting, len: bytes.len() }
     }
 
-    /// Forgets everything since the mark. A carry since then can have changed no byte before it: those up to `len` were final.
+    /// Discards everything since the mark. A later carry cannot have changed a byte before it: those up to `len` were final.
     pub fn rewind(&mut self, mark: Mark) {
         let Mark { low, range, cache, waiting, len } = mark;
         self.bytes.truncate(len);
         (self.low, self.range, self.cache, self.waiting) = (low, range, cache, waiting);
     }
 
-    /// Returns everything written.
+    /// Returns all bytes.
     pub fn finish(mut self) -> Vec<u8> {
         for _ in 0..5 {
             self.shift();
@@ -141,15 +149,12 @@ impl BitCoder for RangeEncoder {
     const WRITES: bool = true;
 
     #[inline]
-    fn bit(&mut self, probability: &mut Probability, bit: bool) -> bool {
-        let bound = (self.range >> BITS) * probability.of_false();
+    fn divide(&mut self, of_false: u32, bit: bool) -> bool {
+        let bound = (self.range >> BITS) * of_false;
         if bit {
             self.low += u64::from(bound);
-            self.range -= bound;
-        } else {
-            self.range = bound;
         }
-        probability.adapt(bit);
+        self.range = if bit { self.range - bound } else { bound };
         self.normalise();
         bit
     }
@@ -166,7 +171,7 @@ impl BitCoder for RangeEncoder {
     }
 }
 
-/// Reads; behind the end of the bytes it reads zeros.
+/// Reading coder; behind the end of the bytes it reads zeros.
 #[derive(Debug, Clone)]
 pub(crate) struct RangeDecoder<'a> {
     range: u32,
@@ -201,16 +206,13 @@ impl BitCoder for RangeDecoder<'_> {
     const WRITES: bool = false;
 
     #[inline]
-    fn bit(&mut self, probability: &mut Probability, _: bool) -> bool {
-        let bound = (self.range >> BITS) * probability.of_false();
+    fn divide(&mut self, of_false: u32, _: bool) -> bool {
+        let bound = (self.range >> BITS) * of_false;
         let bit = self.code >= bound;
         if bit {
             self.code -= bound;
-            self.range -= bound;
-        } else {
-            self.range = bound;
         }
-        probability.adapt(bit);
+        self.range = if bit { self.range - bound } else { bound };
         self.normalise();
         bit
     }

@@ -1,4 +1,4 @@
-//! sRGB by tables.
+//! sRGB curve by tables.
 
 use alloc::{boxed::Box, vec::Vec};
 
@@ -6,13 +6,13 @@ use flyrig_model::srgb;
 
 /// Steps of linear light in the table of codes.
 const LINEAR_STEPS: usize = 4096;
-/// Steps of codes in the table of linear light, four to each of 256.
+/// Steps of codes in the table of linear light, four per code of 0..=255.
 const CODE_STEPS: usize = 1020;
 
 /// Both directions of the sRGB curve (IEC 61966-2-1) on 0..=1, without a power at each value.
 #[derive(Debug, Clone)]
 pub(crate) struct Srgb {
-    /// Code at each step, and how much further the next one is.
+    /// Code at each step, and the difference to the next step.
     code: Box<[[f32; 2]; LINEAR_STEPS + 1]>,
     linear: Vec<f32>,
 }

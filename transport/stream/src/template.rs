@@ -1,65 +1,65 @@
-//! The template: what stays the same of a person from frame to frame.
+//! Template: the attributes of a person that do not change from frame to frame.
 
 use alloc::vec::Vec;
 
 use crate::{
-    CODEC_VERSION, StreamError,
-    avatar::{self, Avatar},
+    attributes::AvatarAttributes,
     bytes::Fields,
+    error::StreamError,
+    message::{CODEC_VERSION, TEMPLATE_MAGIC},
     nodes::{Prediction, predictions},
     order::spatial_order,
     planes::{
         GaussianModel, Influences, NORMAL_LEVELS, POSITION_LEVELS, Quantised, SCALE_LEVELS, normal_of, octahedral,
+        spread,
     },
-    pose::spread,
     range_coder::{RangeDecoder, RangeEncoder},
 };
 
-/// Most bytes of a template.
+/// Largest template, bytes.
 pub const MAX_TEMPLATE_BYTES: usize = 32 << 20;
-/// Most Gaussians.
+/// Largest number of Gaussians.
 const MAX_GAUSSIANS: usize = 1 << 20;
-/// Most joints.
+/// Largest number of joints.
 const MAX_JOINTS: usize = 1024;
-/// Most nodes of the deformation graph.
+/// Largest number of nodes of the deformation graph.
 const MAX_NODES: usize = 1 << 16;
-/// Least bytes a Gaussian, those of a person have 9 to 12: what the time and memory that a message claims are bounded by.
+/// Least bytes per Gaussian (people take 9 to 12): it bounds the time and memory that a message can claim.
 const LEAST_BYTES: usize = 5;
 /// Largest coordinate, metres.
 const MAX_COORDINATE_M: f32 = 1e4;
 
-const MAGIC: [u8; 3] = *b"FLT";
 const WHAT: &str = "template";
 
-/// A joint of the skeleton.
+/// Joint of the skeleton.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct StreamJoint {
-    /// Index of the parent, smaller than the joint's own; none for the first joint alone.
+    /// Index of the parent, smaller than that of the joint; `None` for the first joint alone.
     pub parent: Option<u16>,
     /// Origin in the parent's frame, metres.
     pub translation: [f32; 3],
-    /// Three rows of the inverse bind matrix: canonical space into the joint's frame.
+    /// Three rows of the inverse bind matrix, from canonical space to the joint's frame.
     pub joint_from_canonical: [[f32; 4]; 3],
 }
 
-/// A person as the rig knows it; all slices of Gaussians have one element a Gaussian.
+/// Person to encode; all slices of Gaussians have one element per Gaussian.
 #[derive(Debug, Clone, Copy)]
 pub struct TemplateSource<'a> {
-    /// Parents before children.
+    /// Joints, parents before children.
     pub joints: &'a [StreamJoint],
     /// Canonical centre, metres, and standard deviation, metres.
     pub center_scale: &'a [[f32; 4]],
     /// Unit normal of the surface.
     pub normals: &'a [[f32; 3]],
-    /// Joints that move a Gaussian, with weights.
+    /// Joints that move each Gaussian, with weights.
     pub skin: &'a [([u32; 4], [f32; 4])],
-    /// Nodes that move a Gaussian, with weights; empty without a deformation graph.
+    /// Nodes that move each Gaussian, with weights; empty without a deformation graph.
     pub node_weights: &'a [([u32; 4], [f32; 4])],
     /// Canonical positions of the nodes, metres.
     pub nodes: &'a [[f32; 3]],
 }
 
-/// A template in the order of its bytes: a decoder's Gaussians and nodes are numbered so.
+/// Decoded template; Gaussians and nodes are in the order of its bytes.
 #[derive(Debug, Clone, PartialEq)]
 pub struct StreamTemplate {
     /// XXH3 of the bytes.
@@ -69,34 +69,34 @@ pub struct StreamTemplate {
     /// Centre and standard deviation, metres.
     pub(crate) center_scale: Vec<[f32; 4]>,
     pub(crate) normals: Vec<[f32; 3]>,
-    /// Joints and nodes that move a Gaussian, those that have a weight first.
+    /// Joints and nodes that move each Gaussian, those with a weight first.
     pub(crate) skin: Vec<Influences>,
     pub(crate) node_weights: Vec<Influences>,
-    /// Spread of a Gaussian's nodes at rest, square metres: see [`crate::pose::spread`].
+    /// Spread of the nodes of each Gaussian at rest, square metres, see [`spread`].
     pub(crate) rest_spread: Vec<f32>,
-    /// Canonical positions of the nodes, metres: each that of the Gaussian which hangs on it most.
+    /// Canonical positions of the nodes, metres: each that of the Gaussian with the largest weight on it.
     pub(crate) node_places: Vec<[f32; 3]>,
-    /// Prediction of each node of a motion.
+    /// Prediction of each node.
     pub(crate) predictions: Vec<Prediction>,
-    /// Axes and colours of a person who is driven by poses alone.
-    pub(crate) avatar: Option<Avatar>,
+    /// Axes and colours of an avatar.
+    pub(crate) avatar: Option<AvatarAttributes>,
 }
 
-/// A template with its bytes and the source's order.
+/// Template with its bytes and the order of its source.
 #[derive(Debug, Clone, PartialEq)]
 pub struct EncodedTemplate {
-    /// As a decoder will have it.
+    /// Template as decoders get it.
     pub template: StreamTemplate,
-    /// The message.
+    /// Encoded message.
     pub bytes: Vec<u8>,
-    /// Index in the source of each Gaussian of the template.
+    /// Index of each of the template's Gaussians in the source.
     pub gaussian_order: Vec<u32>,
-    /// Index in the source of each node of the template.
+    /// Index of each of the template's nodes in the source.
     pub node_order: Vec<u32>,
 }
 
 impl TemplateSource<'_> {
-    /// Orders, quantises and encodes it.
+    /// Orders, quantises and encodes the person.
     ///
     /// # Errors
     /// [`StreamError::Template`] when counts differ, an index points nowhere or a number is not finite.
@@ -123,9 +123,9 @@ impl TemplateSource<'_> {
         let per_scale = if largest > 0.0 { SCALE_LEVELS / largest } else { 0.0 };
 
         let mut bytes = Vec::new();
-        bytes.extend(MAGIC);
+        bytes.extend(TEMPLATE_MAGIC);
         bytes.push(CODEC_VERSION);
-        // Planes beyond those of an isotropic surface: none yet.
+        // Number of planes beyond those of an isotropic surface: none yet.
         bytes.extend(0u32.to_le_bytes());
         bytes.extend((count as u32).to_le_bytes());
         bytes.extend((nodes as u32).to_le_bytes());
@@ -159,9 +159,9 @@ impl TemplateSource<'_> {
             before = gaussian;
         }
         let mut bytes = encoder.finish();
-        // Gaussians that resemble one another take fewer; a decoder reads zeros behind the end anyway.
+        // Similar Gaussians take fewer bytes; a decoder reads zeros behind the end anyway.
         bytes.resize(bytes.len().max(head + LEAST_BYTES * count), 0);
-        let template = StreamTemplate::decode(&bytes)?;
+        let template = StreamTemplate::decode_surface(&bytes)?;
         Ok(EncodedTemplate { template, bytes, gaussian_order, node_order })
     }
 
@@ -196,28 +196,21 @@ impl TemplateSource<'_> {
     }
 }
 
-/// Returns the hash that motions name a template by.
+/// Returns the hash by which motions name a template, XXH3 of its bytes.
 #[must_use]
 pub fn template_hash(bytes: &[u8]) -> u64 {
     xxhash_rust::xxh3::xxh3_64(bytes)
 }
 
-/// Whether `parent` may be that of joint `index`.
+/// Returns whether `parent` is a valid parent of joint `index`.
 fn is_parent(parent: Option<u16>, index: usize) -> bool {
     parent.map_or(index == 0, |parent| usize::from(parent) < index)
 }
 
 impl StreamTemplate {
-    /// Reads a template's bytes, or an avatar's.
-    ///
-    /// # Errors
-    /// [`StreamError::Version`] or [`StreamError::Malformed`].
-    pub fn decode(bytes: &[u8]) -> Result<Self, StreamError> {
-        if bytes.starts_with(&avatar::MAGIC) { avatar::decode(bytes) } else { Self::decode_surface(bytes) }
-    }
-
+    /// Decodes a template without axes and colours.
     pub(crate) fn decode_surface(bytes: &[u8]) -> Result<Self, StreamError> {
-        let mut fields = Fields::of(WHAT, MAGIC, bytes)?;
+        let mut fields = Fields::new(WHAT, TEMPLATE_MAGIC, bytes)?;
         fields.check(bytes.len() <= MAX_TEMPLATE_BYTES, "it is too large")?;
         let planes = fields.u32()?;
         fields.check(planes == 0, "it has planes that this program does not know; update it")?;
@@ -299,26 +292,26 @@ impl StreamTemplate {
         Ok(template)
     }
 
-    /// Number of Gaussians.
+    /// Returns the number of Gaussians.
     #[must_use]
     pub fn gaussians(&self) -> usize {
         self.center_scale.len()
     }
 
-    /// Number of nodes of the deformation graph.
+    /// Returns the number of nodes of the deformation graph.
     #[must_use]
     pub fn nodes(&self) -> usize {
         self.nodes
     }
 
-    /// The skeleton.
+    /// Returns the joints of the skeleton.
     #[must_use]
     pub fn joints(&self) -> &[StreamJoint] {
         &self.joints
     }
 }
 
-/// Whether all indices are below `end` and no weight is negative.
+/// Returns whether all indices are below `end` and no weight is negative.
 fn hangs_on(influences: &Influences, end: usize) -> bool {
     influences.index.iter().all(|&i| usize::try_from(i).is_ok_and(|i| i < end))
         && influences.weight.iter().all(|&w| w >= 0)

@@ -1,4 +1,4 @@
-//! A small person for tests.
+//! Small person for tests.
 
 use std::vec::Vec;
 
@@ -6,7 +6,7 @@ use rand::{RngExt as _, SeedableRng as _, rngs::StdRng};
 
 use crate::{EncodedTemplate, Motion, Stamp, StreamJoint, TemplateSource};
 
-/// A person's lists, so that a source can borrow them.
+/// Lists of a person that a source borrows.
 pub(crate) struct Person {
     pub joints: Vec<StreamJoint>,
     pub center_scale: Vec<[f32; 4]>,
@@ -17,7 +17,7 @@ pub(crate) struct Person {
 }
 
 impl Person {
-    /// A tube of three joints, 1.5 m tall.
+    /// Creates a tube of three joints, 1.5 m tall.
     pub fn tube(count: usize, nodes: usize) -> Self {
         let mut random = StdRng::seed_from_u64(11);
         let joint = |i: usize| StreamJoint {
@@ -64,7 +64,7 @@ impl Person {
         self.source().encode().unwrap()
     }
 
-    /// A motion in the source's order.
+    /// Returns a random motion in the source's order.
     pub fn motion(&self, seed: u64) -> Motion {
         let mut random = StdRng::seed_from_u64(seed);
         let rotations = self.joints.iter().map(|_| {
@@ -82,7 +82,7 @@ impl Person {
         }
     }
 
-    /// Smooth colours with some grain, in the source's order, that drift with `time`.
+    /// Returns smooth colours with some grain, in the source's order, that drift with `time`.
     pub fn colors(&self, time: f32) -> Vec<[f32; 4]> {
         let color = |(i, splat): (usize, &[f32; 4])| {
             let [x, y, z, _] = *splat;

@@ -1,18 +1,18 @@
-//! A balanced binary tree over a list of items, and the Haar transform on it.
+//! Haar transform on a balanced binary tree over a list of items.
 //!
-//! The tree follows from the number of items alone: a node of n items has one of the first n - n/2 and one of the last n/2, down
-//! to the level whose nodes have one or two. All nodes of a level weigh the same, whatever their items cover.
+//! The tree follows from the number of items alone: a node of n items has a child of the first n - n/2 and one of the last n/2, down to the
+//! level whose nodes have one or two items. All nodes of a level have the same weight, whatever their items cover.
 
 use alloc::{vec, vec::Vec};
 use core::ops::Range;
 
-/// Segments are the nodes of this level, where the tree has it.
+/// Level whose nodes are the segments, where the tree is that deep.
 const SEGMENT_LEVEL: u32 = 5;
 
-/// Channels of an item.
+/// Number of channels of an item.
 pub(crate) const CHANNELS: usize = 3;
 
-/// The tree of so many items.
+/// Balanced tree.
 ///
 /// Coefficients lie in a list: first the mean of each segment, then from `1 << level` on the differences of a level's nodes
 /// between their first and their second half.
@@ -22,12 +22,12 @@ pub(crate) struct HaarTree {
     /// Level whose nodes have one or two items.
     deepest: u32,
     segment_level: u32,
-    /// First item of each node of the deepest level, and the number of items.
+    /// First item of each node of the deepest level, then the number of items.
     starts: Vec<u32>,
 }
 
 impl HaarTree {
-    /// Of at least one item.
+    /// Creates the tree of a number of items, at least one.
     pub fn new(items: usize) -> Self {
         let items = items.max(1);
         let deepest = items.ilog2();
@@ -45,7 +45,7 @@ impl HaarTree {
         self.items
     }
 
-    /// Number of coefficients, unused ones included.
+    /// Returns the number of coefficients, unused ones included.
     pub fn coefficients(&self) -> usize {
         2 << self.deepest
     }
@@ -54,19 +54,19 @@ impl HaarTree {
         1 << self.segment_level
     }
 
-    /// Levels that have differences.
+    /// Returns the levels that have differences.
     pub fn levels(&self) -> Range<u32> {
         self.segment_level..self.deepest + 1
     }
 
-    /// Places of a level's coefficients that belong to a segment.
+    /// Returns the places of a segment's coefficients in a level.
     pub fn places(&self, level: u32, segment: usize) -> Range<usize> {
         let width = 1 << (level - self.segment_level);
         let first = (1 << level) + segment * width;
         first..first + width
     }
 
-    /// Whether a node of the deepest level has two items; `place` is that of its coefficient.
+    /// Returns whether a node of the deepest level has two items; `place` is that of its coefficient.
     pub fn is_pair(&self, place: usize) -> bool {
         let node = place - (1 << self.deepest);
         self.starts[node + 1] - self.starts[node] == 2
@@ -76,8 +76,8 @@ impl HaarTree {
         self.deepest
     }
 
-    /// Returns the quantisation steps for an error of items that a step of `step` would cause in an orthonormal transform: what moves
-    /// n items is n times as fine in squares.
+    /// Returns the quantisation steps with which items have the error of a step of `step` in an orthonormal transform: the square of the
+    /// step of a coefficient that moves n items is n times smaller.
     pub fn steps(&self, step: f32) -> Steps {
         let items = |level: u32| self.items as f32 / (1u32 << level) as f32;
         let of_level = |level: u32| 2.0 * step / libm::sqrtf(items(level).max(2.0));
@@ -85,8 +85,7 @@ impl HaarTree {
         Steps { mean, first: self.segment_level, differences: self.levels().map(of_level).collect() }
     }
 
-    /// Writes the coefficients of the items, each of which `item` is asked for once, in order; those that no item belongs to are 0.
-    /// `means` is scratch.
+    /// Computes the coefficients of the items; coefficients without an item are 0. Calls `item` once per item, in order; `means` is scratch.
     pub fn forward(
         &self,
         mut item: impl FnMut(usize) -> [f32; CHANNELS],
@@ -114,8 +113,8 @@ impl HaarTree {
         coefficients[..self.segments()].copy_from_slice(&means[..self.segments()]);
     }
 
-    /// Calls `set` with each item, in order. `mean` returns the mean of a segment, `difference` the difference at a place of a level whose
-    /// step is given with it; `means` is scratch.
+    /// Calls `set` with each item, in order. `mean` returns the mean of a segment, `difference` that of a place with the step of its level;
+    /// `means` is scratch.
     pub fn inverse(
         &self,
         steps: &Steps,
@@ -152,7 +151,7 @@ impl HaarTree {
 /// Quantisation steps of a tree's coefficients.
 #[derive(Debug, Clone, Default)]
 pub(crate) struct Steps {
-    /// Of the segments' means.
+    /// Step of the segments' means.
     pub mean: f32,
     /// Level of the first of `differences`.
     first: u32,
@@ -166,11 +165,12 @@ impl Steps {
     }
 }
 
-/// Difference and mean of two halves.
+/// Returns difference and mean of two halves.
 fn split(a: [f32; CHANNELS], b: [f32; CHANNELS]) -> ([f32; CHANNELS], [f32; CHANNELS]) {
     (core::array::from_fn(|c| a[c] - b[c]), core::array::from_fn(|c| 0.5 * (a[c] + b[c])))
 }
 
+/// Returns two halves by their mean and difference.
 fn halves(mean: [f32; CHANNELS], difference: [f32; CHANNELS]) -> [[f32; CHANNELS]; 2] {
     [core::array::from_fn(|c| mean[c] + 0.5 * difference[c]), core::array::from_fn(|c| mean[c] - 0.5 * difference[c])]
 }

@@ -1,4 +1,4 @@
-//! The publisher thread: watches who subscribes, drains the slots, repeats the calibration, ends leases.
+//! Publisher thread: tracks subscriptions, drains the slots, repeats the calibration, ends leases.
 
 use std::{
     collections::BTreeMap,
@@ -15,30 +15,32 @@ use prost::bytes::Bytes;
 use zenoh::{Session, Wait, qos::CongestionControl};
 
 use crate::{
-    Header, MessageKind, TransportError, header,
+    error::TransportError,
+    header::{Header, MessageKind, empty_header},
+    host,
     keys::{self, VIEWER_PREFIX},
     topic::{Body, Pending, Topic, lock},
-    viewpoint::Leases,
+    views::viewpoint::Leases,
 };
 
-/// How often subscriptions and leases are looked at.
+/// Interval between checks of subscriptions and leases.
 const TICK: Duration = Duration::from_millis(50);
 
-/// How often the calibration is repeated for those who came late.
+/// Interval at which the calibration is repeated for late subscribers.
 const REPEAT: Duration = Duration::from_secs(1);
 
-/// A zenoh publisher that could not be declared is tried again after this.
+/// Delay before a zenoh publisher that could not be declared is tried again.
 const DECLARE_RETRY: Duration = Duration::from_secs(1);
 
-/// A message that is repeated.
+/// Message that is repeated.
 #[derive(Clone)]
 pub(crate) struct Retained {
     pub topic: Arc<Topic>,
     pub bytes: Bytes,
 }
 
-/// What the handles, the zenoh callbacks and the publisher thread share.
-pub(crate) struct Shared {
+/// State shared by the handles, the zenoh callbacks and the publisher thread.
+pub(crate) struct PublisherState {
     pub rig: String,
     pub publisher_id: u64,
     pub host_id: u64,
@@ -46,12 +48,12 @@ pub(crate) struct Shared {
     pub calibration: Mutex<Arc<[Retained]>>,
     pub leases: Mutex<Leases>,
     pub stop: AtomicBool,
-    /// Holds at most one wake-up.
+    /// Channel of wake-ups, which holds at most one.
     pub wake: Sender<()>,
 }
 
-impl Shared {
-    /// Of a session that publishes these topics; the other end of its wake-ups.
+impl PublisherState {
+    /// Creates the state of a session that publishes these topics, and the receiver of its wake-ups.
     pub(crate) fn new(
         rig: &str,
         session: &Session,
@@ -61,8 +63,8 @@ impl Shared {
         let (wake, woken) = crossbeam::channel::bounded(1);
         let shared = Self {
             rig: rig.to_owned(),
-            publisher_id: header::fnv1a(session.zid().to_string().as_bytes()),
-            host_id: header::host_id(),
+            publisher_id: host::fnv1a(session.zid().to_string().as_bytes()),
+            host_id: host::host_id(),
             topics: Mutex::new(topics.iter().map(|topic| (topic.label.clone(), topic.clone())).collect()),
             calibration: Mutex::new(Arc::new([])),
             leases: Mutex::new(leases),
@@ -73,11 +75,11 @@ impl Shared {
     }
 
     pub(crate) fn wake(&self) {
-        // Full means that it wakes anyway.
+        // A full channel wakes the thread anyway.
         let _ = self.wake.try_send(());
     }
 
-    /// Viewers' topics follow the leases, so that days of viewers coming and going leave nothing behind.
+    /// Adds and removes the viewers' topics according to the leases, so that viewers who come and go for days leave nothing behind.
     pub(crate) fn sync_viewer_topics(&self) {
         let views: Vec<String> = lock(&self.leases).viewpoints().into_iter().map(|viewpoint| viewpoint.view).collect();
         let mut topics = lock(&self.topics);
@@ -91,22 +93,23 @@ impl Shared {
     }
 }
 
-/// A topic with its zenoh publisher; `None` until declared.
+/// Topic with its zenoh publisher; `None` until declared.
 struct Lane {
     topic: Arc<Topic>,
     publisher: Option<zenoh::pubsub::Publisher<'static>>,
     declare_at: Instant,
 }
 
+/// Work of the publisher thread.
 pub(crate) struct Drain {
-    pub shared: Arc<Shared>,
+    pub shared: Arc<PublisherState>,
     pub session: Session,
     pub woken: Receiver<()>,
 }
 
-/// The thread with its session, ended together.
+/// Publisher thread and its session, which end together.
 pub(crate) struct DrainThread {
-    shared: Arc<Shared>,
+    shared: Arc<PublisherState>,
     session: Session,
     thread: SupervisedThread,
     is_stopped: bool,
@@ -117,7 +120,7 @@ impl DrainThread {
         Self::start_with(drain, || {})
     }
 
-    /// Calls `each_turn` in every turn of the thread: for tests, which let it panic.
+    /// Starts the thread with a callback for every turn, in which tests panic.
     fn start_with(drain: Drain, each_turn: impl Fn() + Send + 'static) -> Result<Self, TransportError> {
         let (shared, session) = (drain.shared.clone(), drain.session.clone());
         let thread = SupervisedThread::start("publish", move || drain.run(&each_turn))
@@ -129,7 +132,7 @@ impl DrainThread {
         self.thread.health()
     }
 
-    /// Ends both; the second time nothing.
+    /// Ends thread and session; does nothing the second time.
     pub(crate) fn stop(&mut self) -> Result<(), TransportError> {
         if std::mem::replace(&mut self.is_stopped, true) {
             return Ok(());
@@ -139,7 +142,7 @@ impl DrainThread {
         self.thread.join();
         let joined = match self.thread.health() {
             ThreadHealth { panic: Some(text), has_failed: true, .. } => {
-                Err(TransportError::session("publisher thread", &format!("it panicked again and again: {text}")))
+                Err(TransportError::session("publisher thread", &format!("it panicked repeatedly: {text}")))
             }
             _ => Ok(()),
         };
@@ -157,7 +160,7 @@ impl Drop for DrainThread {
 }
 
 impl Drain {
-    /// Runs until it is stopped. After a panic it can be called again: it declares its publishers anew.
+    /// Runs until stopped. After a panic it may be called again: it declares its publishers anew.
     fn run(&self, each_turn: &impl Fn()) {
         let mut lanes: Vec<Lane> = Vec::new();
         let mut next_tick = Instant::now();
@@ -187,7 +190,7 @@ impl Drain {
                     lane.topic.count(&result);
                 }
             }
-            // Whoever offers a message wakes us after it is in its slot, so nothing is overslept.
+            // The wake-up follows the message into its slot, so no message is overlooked.
             let _ = self.woken.recv_deadline(next_tick);
         }
     }
@@ -228,7 +231,7 @@ impl Drain {
             .ok_or_else(|| TransportError::session(topic.label.clone(), &"zenoh has not taken the topic yet"))?;
         let payload = pending.body.encode(&topic.name)?;
         let len = payload.len();
-        // What is passed on keeps the host whose clock its times are of.
+        // Messages passed on keep the host by whose clock they are timed.
         let host = if pending.header.host == 0 { self.shared.host_id } else { pending.header.host };
         let header = Header { publisher: self.shared.publisher_id, host, ..pending.header };
         let put = publisher.put(payload).attachment(pending.attachment(header));
@@ -237,7 +240,7 @@ impl Drain {
     }
 }
 
-/// Asks zenoh who subscribes; true when a topic of the calibration became watched.
+/// Asks zenoh for subscriptions; returns whether a topic of the calibration has gained a subscriber.
 fn update_watched(lanes: &[Lane]) -> bool {
     let mut calibration_wanted = false;
     for lane in lanes {
@@ -250,47 +253,20 @@ fn update_watched(lanes: &[Lane]) -> bool {
     calibration_wanted
 }
 
-/// A header for [`Topic::offer`] to fill in.
-pub(crate) fn empty_header() -> Header {
-    Header {
-        kind: MessageKind::Stats,
-        sequence: 0,
-        frame: 0,
-        capture_nanos: 0,
-        publish_unix_nanos: header::unix_nanos(),
-        host: 0,
-        publisher: 0,
-        width: 0,
-        height: 0,
-    }
-}
-
 #[cfg(test)]
 mod tests {
     use std::sync::atomic::AtomicU64;
 
     use super::*;
-    use crate::{
-        TransportConfig,
-        session::{self, Opened},
-    };
+    use crate::testing::{loopback_session, wait_until};
 
-    /// A drain of one topic, and how it is offered a message.
+    /// Returns a drain and its only topic.
     fn drain() -> (Drain, Arc<Topic>) {
-        let config = TransportConfig { listen: vec!["tcp/127.0.0.1:0".to_owned()], ..TransportConfig::default() };
-        let Opened { session, .. } = session::open(&config, 1 << 16, &[]).unwrap();
+        let session = loopback_session();
         let topic = Arc::new(Topic::new("stats".to_owned(), "stats".to_owned(), MessageKind::Stats));
         let leases = Leases::new(0, Duration::ZERO, 0);
-        let (shared, woken) = Shared::new("drill", &session, std::slice::from_ref(&topic), leases);
+        let (shared, woken) = PublisherState::new("drill", &session, std::slice::from_ref(&topic), leases);
         (Drain { shared, session, woken }, topic)
-    }
-
-    fn wait_until(what: &str, is_true: impl Fn() -> bool) {
-        let deadline = Instant::now() + Duration::from_secs(20);
-        while !is_true() {
-            assert!(Instant::now() < deadline, "{what} did not happen");
-            std::thread::sleep(Duration::from_millis(10));
-        }
     }
 
     #[test]
@@ -322,11 +298,11 @@ mod tests {
     }
 
     #[test]
-    fn a_publisher_that_panics_again_and_again_says_so_at_its_end() {
+    fn a_publisher_that_panics_repeatedly_reports_it_at_its_end() {
         let (drain, _) = drain();
         let mut thread = DrainThread::start_with(drain, || panic!("no turn works")).unwrap();
         wait_until("the end", || thread.health().has_failed);
         let error = thread.stop().unwrap_err().to_string();
-        assert!(error.contains("it panicked again and again: no turn works"), "{error}");
+        assert!(error.contains("it panicked repeatedly: no turn works"), "{error}");
     }
 }

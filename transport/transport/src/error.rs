@@ -1,31 +1,33 @@
-//! What can go wrong on the wire.
+//! Errors of the transport.
 
-use crate::printable;
+use flyrig_stream::SplatError;
 
-/// Sort of a [`TransportError`], for those who decide what to do next.
+use crate::{printable::printable, schema::SCHEMA_VERSION};
+
+/// Kind of a [`TransportError`], for callers that react to it.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
 pub enum TransportErrorKind {
-    /// A setting, name or request of our own side is not usable.
+    /// Invalid setting, name or request of this side.
     Config,
-    /// The zenoh session failed.
+    /// Failure of the zenoh session.
     Session,
-    /// The other side speaks a schema version that we do not know.
+    /// Schema version of the other side that this program does not know.
     UnknownVersion,
-    /// A message cannot be what it claims to be.
+    /// Malformed message.
     Malformed,
-    /// The session is closed.
+    /// Closed session.
     Closed,
 }
 
-/// An error that names the thing and the fix. Both texts are [`printable`]: either may repeat what another program sent.
+/// Error that names the faulty item and the fix. Both texts are [`printable()`]: either may repeat what another program sent.
 #[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
 #[error("{topic}: {message}")]
 pub struct TransportError {
-    /// Sort.
+    /// Kind.
     pub kind: TransportErrorKind,
-    /// Key, setting or message part that is meant.
+    /// Key, setting or part of a message that is at fault.
     pub topic: String,
-    /// What is wrong and what helps.
+    /// Fault and fix.
     pub message: String,
 }
 
@@ -48,13 +50,23 @@ impl TransportError {
     }
 
     pub(crate) fn version(topic: impl Into<String>, found: impl std::fmt::Display) -> Self {
-        let ours = crate::SCHEMA_VERSION;
         Self::new(
             TransportErrorKind::UnknownVersion,
             topic,
             format!(
-                "speaks schema version {found}, this program knows version {ours}; run the same flyrig on both sides"
+                "speaks schema version {found}, this program knows version {SCHEMA_VERSION}; run the same flyrig on both sides"
             ),
         )
+    }
+}
+
+impl From<SplatError> for TransportError {
+    fn from(error: SplatError) -> Self {
+        let kind = match error {
+            SplatError::State(_) => TransportErrorKind::Config,
+            SplatError::Version(_) => TransportErrorKind::UnknownVersion,
+            SplatError::Malformed(_) => TransportErrorKind::Malformed,
+        };
+        Self::new(kind, "splats", error.to_string())
     }
 }

@@ -1,26 +1,21 @@
-//! What every message carries beside its payload, as the zenoh attachment.
+//! Header that every message carries as its zenoh attachment.
 
-use std::time::{SystemTime, UNIX_EPOCH};
-
-use crate::TransportError;
-
-/// Version of keys, headers and payloads; raised by any change that an older program would misread.
-pub const SCHEMA_VERSION: u16 = 1;
+use crate::{error::TransportError, host::unix_nanos, schema::SCHEMA_VERSION};
 
 /// Bytes of an encoded [`Header`].
 pub const HEADER_BYTES: usize = 64;
 
-/// Longest attachment that is looked at, bytes.
+/// Longest attachment that is read, bytes.
 pub(crate) const MAX_ATTACHMENT: usize = 4 * HEADER_BYTES;
 
 const MAGIC: [u8; 4] = *b"FLYR";
 
-/// Which payload a message has.
+/// Kind of a message's payload.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum MessageKind {
     /// foxglove `CompressedImage`.
     View,
-    /// [`crate::SplatState`].
+    /// [`flyrig_stream::SplatState`].
     Splats,
     /// foxglove `CameraCalibration`.
     Calibration,
@@ -28,13 +23,13 @@ pub enum MessageKind {
     Transforms,
     /// [`crate::RigStats`].
     Stats,
-    /// A camera's image, see [`crate::FrameHeader`].
+    /// Image of a camera, see [`crate::FrameHeader`].
     Frame,
     /// [`crate::CameraStatus`].
     CameraStatus,
     /// [`flyrig_stream::Motion`].
     Motion,
-    /// A layer of a person's colours, for [`flyrig_stream::ColorDecoder`].
+    /// Layer of a person's colours, for [`flyrig_stream::ColorDecoder`].
     Colors,
 }
 
@@ -66,32 +61,49 @@ impl MessageKind {
     }
 }
 
-/// Fixed little-endian layout of 64 bytes: magic `FLYR`, version u16, kind u8, 0, then the fields in
-/// their order here.
+/// Message header with a fixed little-endian layout of 64 bytes: magic `FLYR`, version u16, kind u8, 0, then the fields in this order.
+///
+/// ```
+/// use flyrig_transport::{Header, MessageKind};
+///
+/// let header = Header {
+///     kind: MessageKind::Stats,
+///     sequence: 7,
+///     frame: 120,
+///     capture_nanos: 4_000_000_000,
+///     publish_unix_nanos: 1_700_000_000_000_000_000,
+///     host: 1,
+///     publisher: 2,
+///     width: 0,
+///     height: 0,
+/// };
+/// assert_eq!(Header::decode("stats", &header.encode())?, header);
+/// # Ok::<(), flyrig_transport::TransportError>(())
+/// ```
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct Header {
-    /// Which payload follows.
+    /// Kind of the payload.
     pub kind: MessageKind,
-    /// Counts the messages of this topic from 0; a gap is a loss on the way (or a newer one won).
+    /// Sequence number within the topic, from 0; a gap is a message that was lost, or replaced by a newer one.
     pub sequence: u64,
-    /// The rig's frame number.
+    /// Frame number of the rig.
     pub frame: u64,
-    /// `CLOCK_MONOTONIC` of the capturing host.
+    /// Capture time, `CLOCK_MONOTONIC` of the capturing host.
     pub capture_nanos: i64,
-    /// Wall clock of the publisher when the message was handed to it, since 1970.
+    /// Time at which the message was handed to the publisher, by its wall clock, nanoseconds since 1970.
     pub publish_unix_nanos: i64,
-    /// Tells hosts (and their restarts) apart: only within one host is the latency exact. 0 when unknown.
+    /// Identity of the host since its boot: only within one host is the latency exact. 0 when unknown.
     pub host: u64,
-    /// Tells publishers (and their restarts) apart.
+    /// Identity of the publisher since its start.
     pub publisher: u64,
-    /// Pixels of a view, else 0.
+    /// Width of a view, pixels; otherwise 0.
     pub width: u32,
-    /// Pixels of a view, else 0.
+    /// Height of a view, pixels; otherwise 0.
     pub height: u32,
 }
 
 impl Header {
-    /// As on the wire.
+    /// Encodes the header.
     #[must_use]
     pub fn encode(&self) -> [u8; HEADER_BYTES] {
         let mut bytes = [0; HEADER_BYTES];
@@ -114,17 +126,17 @@ impl Header {
         bytes
     }
 
-    /// From the wire.
+    /// Decodes a header; errors name `topic`.
     ///
     /// # Errors
-    /// `UnknownVersion` for another schema version, else `Malformed`; `topic` stands in the text.
+    /// `UnknownVersion` for another schema version, otherwise `Malformed`.
     pub fn decode(topic: &str, bytes: &[u8]) -> Result<Self, TransportError> {
         let malformed = |message: String| TransportError::malformed(topic, message);
         let mut reader = Reader(bytes);
         if reader.take::<4>() != Some(MAGIC) {
             return Err(malformed("the message has no flyrig header; something else publishes on this key".to_owned()));
         }
-        // The version comes before any other check: the rest may have another form.
+        // The version is checked first: the rest may have another layout.
         let version = reader.take().map(u16::from_le_bytes);
         if version.is_some_and(|version| version != SCHEMA_VERSION) {
             return Err(TransportError::version(topic, version.unwrap_or_default()));
@@ -150,7 +162,22 @@ impl Header {
     }
 }
 
-/// Takes fixed-size pieces off a byte slice.
+/// Returns a header for [`crate::topic::Topic::offer`] to fill in.
+pub(crate) fn empty_header() -> Header {
+    Header {
+        kind: MessageKind::Stats,
+        sequence: 0,
+        frame: 0,
+        capture_nanos: 0,
+        publish_unix_nanos: unix_nanos(),
+        host: 0,
+        publisher: 0,
+        width: 0,
+        height: 0,
+    }
+}
+
+/// Reader of fixed-size pieces off the front of a byte slice.
 pub(crate) struct Reader<'a>(pub &'a [u8]);
 
 impl Reader<'_> {
@@ -161,26 +188,10 @@ impl Reader<'_> {
     }
 }
 
-/// Wall clock, nanoseconds since 1970.
-pub(crate) fn unix_nanos() -> i64 {
-    let since = SystemTime::now().duration_since(UNIX_EPOCH).unwrap_or_default();
-    i64::try_from(since.as_nanos()).unwrap_or(i64::MAX)
-}
-
-/// A number for this host since its last boot; 0 where the system does not tell.
-pub(crate) fn host_id() -> u64 {
-    std::fs::read("/proc/sys/kernel/random/boot_id").map_or(0, |id| fnv1a(&id))
-}
-
-/// FNV-1a, 64 bits: short, the same on every machine, not for security.
-pub(crate) fn fnv1a(bytes: &[u8]) -> u64 {
-    bytes.iter().fold(0xcbf2_9ce4_8422_2325, |hash, &b| (hash ^ u64::from(b)).wrapping_mul(0x0100_0000_01b3))
-}
-
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::TransportErrorKind;
+    use crate::{error::TransportErrorKind, host::host_id};
 
     fn header() -> Header {
         Header {

@@ -1,4 +1,4 @@
-//! Received messages that wait for their reader: one slot a topic, the newest wins, bounded in bytes over all topics.
+//! Received messages that wait for their reader: one slot per topic, the newest message wins, bounded in bytes over all topics.
 
 use std::{
     collections::{BTreeMap, VecDeque},
@@ -12,35 +12,39 @@ use prost::bytes::Bytes;
 use zenoh::sample::Sample;
 
 use crate::{
-    Header, MessageKind, TransportError, TransportErrorKind,
-    calibration::{RigTransforms, decode_calibration, decode_transforms},
-    color_layers::ColorLayers,
-    header, keys,
+    cameras::calibration::{RigTransforms, decode_calibration, decode_transforms},
+    error::{TransportError, TransportErrorKind},
+    expected::{check_label, expected_payload},
+    header::{self, Header, MessageKind},
+    host,
+    keys::{self, MAX_PERSON_TOPICS},
+    people::color_layers::ColorLayers,
     report::{Tally, TopicReport},
-    splats::{self, MAX_PERSON_TOPICS},
+    schema::SCHEMA_VERSION,
     topic::lock,
-    view,
 };
 
-/// Most topics that a subscriber keeps slots for.
+/// Largest number of topics that a subscriber keeps slots for.
 const MAX_TOPICS: usize = 256;
 
-/// Most errors that wait to be told; later ones are only counted.
+/// Largest number of errors that wait to be reported; later ones are only counted.
 const MAX_ERRORS: usize = 16;
 
-/// A message as it came, undecoded.
+/// Received message, not yet decoded.
 #[derive(Debug)]
 pub(crate) struct Raw {
     pub header: Header,
     pub payload: Bytes,
+    /// Publisher's hand-in to arrival, by wall clocks.
     pub latency_nanos: i64,
+    /// Whether both ends run on one host.
     pub exact: bool,
 }
 
 #[derive(Debug, Default)]
 struct Slot {
     raw: Option<Raw>,
-    /// Number of the message that came last, over all topics.
+    /// Number of the latest message, counted over all topics.
     arrival: u64,
     tally: Tally,
 }
@@ -48,31 +52,31 @@ struct Slot {
 #[derive(Debug, Default)]
 struct State {
     slots: BTreeMap<String, Slot>,
-    /// Messages that came, over all topics.
+    /// Number of messages received over all topics.
     arrivals: u64,
     /// Payload bytes in all slots.
     waiting: u64,
-    /// Label that was served last, for turns.
+    /// Label that was served last, so that topics take turns.
     served: String,
     errors: VecDeque<TransportError>,
-    /// Whether the reader got an error last: then a message goes first, so that errors never hold messages up.
+    /// Whether the reader last got an error: then a message goes first, so that errors never delay messages.
     erred: bool,
     unreadable: u64,
-    /// With the publisher it came from: calibrations of two publishers are never mixed.
+    /// Intrinsics with their publisher: calibrations of two publishers are never mixed.
     lenses: BTreeMap<CameraId, (u64, Intrinsics)>,
     places: Option<(u64, RigTransforms)>,
     publishers: Vec<String>,
 }
 
-/// Shared by the zenoh callbacks and the reader.
+/// Mailbox shared by the zenoh callbacks and the reader.
 #[derive(Debug)]
 pub(crate) struct Inbox {
     state: Mutex<State>,
     changed: Condvar,
     host: u64,
-    /// Most payload bytes in all slots.
+    /// Bound of the payload bytes in all slots.
     quota: u64,
-    /// Label and name of our own viewpoint's view.
+    /// Label and name of the view of this subscriber's viewpoint.
     own_view: (String, String),
     color_layers: Mutex<ColorLayers>,
 }
@@ -85,8 +89,7 @@ impl State {
         Some(raw)
     }
 
-    /// Drops payloads of other topics than `label` until `bytes` more fit: the largest first, so that a topic of huge
-    /// messages loses its own.
+    /// Drops payloads of topics other than `label` until `bytes` more fit, the largest first: a topic of huge messages loses its own.
     fn make_room(&mut self, label: &str, bytes: u64, quota: u64) {
         while self.waiting.saturating_add(bytes) > quota {
             let size = |slot: &Slot| slot.raw.as_ref().map(|raw| (raw.payload.len(), u64::MAX - slot.arrival));
@@ -101,7 +104,7 @@ impl State {
         }
     }
 
-    /// Forgets the topic of a person that came longest ago when there are as many as are kept: persons come and go for days.
+    /// Forgets the least recent of `most` topics with this prefix, so that people may come and go for days.
     fn forget_person(&mut self, prefix: &str, most: usize) {
         let persons = self.slots.iter().filter(|(label, _)| label.starts_with(prefix));
         let oldest = persons.clone().min_by_key(|(_, slot)| slot.arrival).map(|(label, _)| label.clone());
@@ -110,38 +113,80 @@ impl State {
             self.slots.remove(&oldest);
         }
     }
+
+    /// Stores the parts of the rig's calibration, whose payloads need no slot.
+    fn keep_calibration(&mut self, header: &Header, payload: &[u8]) -> Result<(), TransportError> {
+        match header.kind {
+            MessageKind::Calibration => {
+                let (id, lens) = decode_calibration(payload)?;
+                self.lenses.retain(|_, (publisher, _)| *publisher == header.publisher);
+                if self.lenses.len() < MAX_TOPICS || self.lenses.contains_key(&id) {
+                    self.lenses.insert(id, (header.publisher, lens));
+                }
+            }
+            MessageKind::Transforms => self.places = Some((header.publisher, decode_transforms(payload)?)),
+            MessageKind::View
+            | MessageKind::Splats
+            | MessageKind::Stats
+            | MessageKind::Frame
+            | MessageKind::CameraStatus
+            | MessageKind::Motion
+            | MessageKind::Colors => {}
+        }
+        Ok(())
+    }
+
+    /// Makes room for a slot of this label: refuses one topic too many, and forgets a person in favour of a new one.
+    fn make_slot(&mut self, key: &str, label: &str) -> Result<(), TransportError> {
+        if self.slots.contains_key(label) {
+            return Ok(());
+        }
+        if self.slots.len() >= MAX_TOPICS {
+            return Err(TransportError::malformed(key, format!("more than {MAX_TOPICS} topics")));
+        }
+        if label.starts_with(keys::PERSON_SPLATS) {
+            self.forget_person(keys::PERSON_SPLATS, MAX_PERSON_TOPICS);
+        }
+        if keys::is_person(label) {
+            self.forget_person(keys::PERSON, (1 + flyrig_stream::LAYERS) * MAX_PERSON_TOPICS);
+        }
+        Ok(())
+    }
+}
+
+/// Timing of a message that has arrived.
+#[derive(Clone, Copy)]
+struct Observed {
+    now: Instant,
+    /// Publisher's hand-in to arrival, by wall clocks.
+    latency_nanos: i64,
+    /// Messages of the topic that were missed before it.
+    missed: u64,
 }
 
 impl Inbox {
     pub(crate) fn new(own_view_name: String, quota: u64) -> Self {
         let own_view = (keys::view_label(&own_view_name), own_view_name);
         let color_layers = Mutex::new(ColorLayers::new(Instant::now()));
-        Self {
-            state: Mutex::default(),
-            changed: Condvar::new(),
-            host: header::host_id(),
-            quota,
-            own_view,
-            color_layers,
-        }
+        Self { state: Mutex::default(), changed: Condvar::new(), host: host::host_id(), quota, own_view, color_layers }
     }
 
-    /// Layers of colours that the line carries, from the coarsest; none before [`Self::begin_colors`].
+    /// Returns the number of colour layers that the line carries, from the coarsest; 0 before [`Self::begin_colors`].
     pub(crate) fn color_layers(&self) -> usize {
         lock(&self.color_layers).wanted()
     }
 
-    /// A thread that only waited ran so late.
+    /// Records that a thread which only waits ran late by `by`.
     pub(crate) fn woke_late(&self, by: Duration) {
         lock(&self.color_layers).woke_late(by);
     }
 
-    /// A template is being fetched from now on.
+    /// Records that a template is being fetched from now on.
     pub(crate) fn fetch_begins(&self) {
         lock(&self.color_layers).fetch_begins(Instant::now());
     }
 
-    /// A template has come with so many bytes; none where it has not.
+    /// Records that a template has arrived with `bytes` bytes, or with 0 that the fetch failed.
     pub(crate) fn fetch_ends(&self, bytes: usize) {
         lock(&self.color_layers).fetch_ends(Instant::now(), bytes);
     }
@@ -150,19 +195,19 @@ impl Inbox {
         lock(&self.color_layers).has_begun()
     }
 
-    /// Lets colours begin.
+    /// Begins to subscribe to colours.
     pub(crate) fn begin_colors(&self) {
         lock(&self.color_layers).begin();
     }
 
-    /// Name of a view for its reader; `None` for other topics.
+    /// Returns the name of a label's view; `None` for other topics.
     pub(crate) fn view_name<'a>(&'a self, label: &'a str) -> Option<&'a str> {
         if label == self.own_view.0 { Some(&self.own_view.1) } else { label.strip_prefix("view/") }
     }
 
-    /// Takes a sample in; runs on a zenoh thread.
+    /// Ingests a sample; runs on a zenoh thread.
     pub(crate) fn receive(&self, sample: &Sample) {
-        let (now, unix_nanos) = (Instant::now(), header::unix_nanos());
+        let (now, unix_nanos) = (Instant::now(), host::unix_nanos());
         let key = sample.key_expr().as_str();
         let attachment = sample.attachment().filter(|bytes| bytes.len() <= header::MAX_ATTACHMENT);
         let attachment = attachment.map(zenoh::bytes::ZBytes::to_bytes).unwrap_or_default();
@@ -173,6 +218,8 @@ impl Inbox {
         }
     }
 
+    /// Checks a message and puts it into the slot of its topic. `len` is the length of the payload, which is copied once it is
+    /// known to fit.
     fn accept(
         &self,
         key: &str,
@@ -184,73 +231,13 @@ impl Inbox {
     ) -> Result<(), TransportError> {
         let header = Header::decode(key, attachment)?;
         let label = keys::label_in(key).unwrap_or_default();
-        let malformed = |message: String| TransportError::malformed(key, message);
-        // Names reach the reader, and a slot keeps its name.
-        for (prefix, what) in [("view/", "view"), ("calibration/", "camera")] {
-            if let Some(name) = label.strip_prefix(prefix) {
-                keys::check_name(what, name).map_err(|error| malformed(error.to_string()))?;
-            }
-        }
-        if let Some(person) = label.strip_prefix(keys::PERSON_SPLATS)
-            && person.parse().map(keys::splats_label).as_deref() != Ok(label)
-        {
-            return Err(malformed("names no person; expected a number".to_owned()));
-        }
-        if keys::is_person(label) && keys::person_in(label).is_none() {
-            return Err(malformed("names no part of the person stream".to_owned()));
-        }
-        let (expected, limit) = match label {
-            "splats" => (MessageKind::Splats, splats::MAX_BYTES),
-            "stats" => (MessageKind::Stats, crate::stats::MAX_JSON_BYTES),
-            "transforms" => (MessageKind::Transforms, crate::calibration::MAX_BYTES),
-            _ if label.starts_with(keys::PERSON_SPLATS) => (MessageKind::Splats, splats::MAX_BYTES),
-            _ if keys::is_person(label) && label.ends_with("/motion") => {
-                (MessageKind::Motion, flyrig_stream::MAX_MESSAGE_BYTES)
-            }
-            _ if keys::is_person(label) => (MessageKind::Colors, flyrig_stream::MAX_MESSAGE_BYTES),
-            _ if label.starts_with("calibration/") => (MessageKind::Calibration, crate::calibration::MAX_BYTES),
-            _ => (MessageKind::View, view::MAX_MESSAGE_BYTES),
-        };
-        if header.kind != expected {
-            let found = header.kind;
-            return Err(malformed(format!("holds {found:?}, expected {expected:?}")));
-        }
-        if len > limit {
-            return Err(malformed(format!("{len} bytes, at most {limit}")));
-        }
-        if len as u64 > self.quota {
-            let quota = self.quota;
-            return Err(malformed(format!("{len} bytes, over the inbox of {quota} bytes; raise inbox-bytes")));
-        }
+        check_label(key, label)?;
+        self.check_payload(key, label, header.kind, len)?;
         let payload = payload();
         let mut state = lock(&self.state);
-        match header.kind {
-            MessageKind::Calibration => {
-                let (id, lens) = decode_calibration(&payload)?;
-                state.lenses.retain(|_, (publisher, _)| *publisher == header.publisher);
-                if state.lenses.len() < MAX_TOPICS || state.lenses.contains_key(&id) {
-                    state.lenses.insert(id, (header.publisher, lens));
-                }
-            }
-            MessageKind::Transforms => state.places = Some((header.publisher, decode_transforms(&payload)?)),
-            MessageKind::View
-            | MessageKind::Splats
-            | MessageKind::Stats
-            | MessageKind::Frame
-            | MessageKind::CameraStatus
-            | MessageKind::Motion
-            | MessageKind::Colors => {}
-        }
-        if state.slots.len() >= MAX_TOPICS && !state.slots.contains_key(label) {
-            return Err(malformed(format!("more than {MAX_TOPICS} topics")));
-        }
-        if label.starts_with(keys::PERSON_SPLATS) && !state.slots.contains_key(label) {
-            state.forget_person(keys::PERSON_SPLATS, MAX_PERSON_TOPICS);
-        }
-        if keys::is_person(label) && !state.slots.contains_key(label) {
-            state.forget_person(keys::PERSON, (1 + flyrig_stream::LAYERS) * MAX_PERSON_TOPICS);
-        }
-        let waits = !matches!(expected, MessageKind::Calibration | MessageKind::Transforms);
+        state.keep_calibration(&header, &payload)?;
+        state.make_slot(key, label)?;
+        let waits = !matches!(header.kind, MessageKind::Calibration | MessageKind::Transforms);
         let is_replaced = waits && state.take(label).is_some();
         if waits {
             state.make_room(label, payload.len() as u64, self.quota);
@@ -265,21 +252,44 @@ impl Inbox {
         let missed_before = slot.tally.totals.missed;
         slot.tally.add(&header, payload.len(), now, latency_nanos, exact);
         slot.tally.totals.replaced += u64::from(is_replaced);
-        if matches!(expected, MessageKind::Motion | MessageKind::Colors) {
-            let layer = keys::person_in(label).and_then(|(_, layer)| layer);
-            lock(&self.color_layers).count(layer, payload.len());
-        }
-        if expected == MessageKind::Motion {
-            let missed = slot.tally.totals.missed.saturating_sub(missed_before);
-            lock(&self.color_layers).motion(now, latency_nanos, missed);
-        }
+        let missed = slot.tally.totals.missed.saturating_sub(missed_before);
+        self.observe_line(label, header.kind, payload.len(), Observed { now, latency_nanos, missed });
         slot.raw = waits.then_some(Raw { header, payload, latency_nanos, exact });
         drop(state);
         self.changed.notify_all();
         Ok(())
     }
 
-    /// A message or publisher that cannot be read: counted, and reported once.
+    /// Checks kind and length of a topic's payload.
+    fn check_payload(&self, key: &str, label: &str, found: MessageKind, len: usize) -> Result<(), TransportError> {
+        let malformed = |message: String| Err(TransportError::malformed(key, message));
+        let (expected, limit) = expected_payload(label);
+        if found != expected {
+            return malformed(format!("holds {found:?}, expected {expected:?}"));
+        }
+        if len > limit {
+            return malformed(format!("{len} bytes, at most {limit}"));
+        }
+        if len as u64 > self.quota {
+            let quota = self.quota;
+            return malformed(format!("{len} bytes, over the inbox of {quota} bytes; raise inbox-bytes"));
+        }
+        Ok(())
+    }
+
+    /// Reports a message of the person stream to the choice of colour layers.
+    fn observe_line(&self, label: &str, kind: MessageKind, bytes: usize, observed: Observed) {
+        if !matches!(kind, MessageKind::Motion | MessageKind::Colors) {
+            return;
+        }
+        let mut layers = lock(&self.color_layers);
+        layers.count(keys::person_in(label).and_then(|(_, layer)| layer), bytes);
+        if kind == MessageKind::Motion {
+            layers.motion(observed.now, observed.latency_nanos, observed.missed);
+        }
+    }
+
+    /// Counts a message or publisher that cannot be read, and reports its error once.
     pub(crate) fn refuse(&self, error: TransportError) {
         let mut state = lock(&self.state);
         state.unreadable += 1;
@@ -294,10 +304,10 @@ impl Inbox {
         lock(&self.state).unreadable += 1;
     }
 
-    /// Keeps count of publishers as their liveliness tokens come and go.
+    /// Counts publishers by their liveliness tokens.
     pub(crate) fn publisher_alive(&self, key: &str, alive: bool) {
         let version = keys::version_in(key).unwrap_or_default();
-        if version != format!("v{}", crate::SCHEMA_VERSION) {
+        if version != format!("v{SCHEMA_VERSION}") {
             if alive {
                 self.refuse(TransportError::version(key, version));
             }
@@ -312,7 +322,7 @@ impl Inbox {
         self.changed.notify_all();
     }
 
-    /// The next untaken message among the labels that `wanted` says, in turns.
+    /// Takes the next waiting message among the labels that `wanted` accepts; topics take turns.
     pub(crate) fn next(
         &self,
         timeout: Duration,
@@ -329,7 +339,7 @@ impl Inbox {
         })
     }
 
-    /// The whole rig once its parts have come. Parts that make no valid rig are forgotten, so that they are reported once.
+    /// Returns the rig once all of its parts have arrived. Parts that form no valid rig are forgotten, so that they are reported once.
     pub(crate) fn rig(&self, timeout: Duration) -> Result<Option<Rig>, TransportError> {
         let rig = |state: &State| {
             let (publisher, places) = state.places.as_ref()?;
@@ -403,7 +413,7 @@ impl Inbox {
     }
 }
 
-/// A decoding error's kind seen from the reader: whatever is wrong with a message is the message's fault.
+/// Maps any decoding error but an unknown version to `Malformed`.
 pub(crate) fn as_malformed(error: TransportError) -> TransportError {
     match error.kind {
         TransportErrorKind::UnknownVersion => error,
@@ -416,7 +426,7 @@ mod tests {
     use flyrig_types::{Isometry, Lens};
 
     use super::*;
-    use crate::drain::empty_header;
+    use crate::header::empty_header;
 
     const QUOTA: u64 = 1 << 20;
 
@@ -552,10 +562,10 @@ mod tests {
             inbox.refuse(TransportError::malformed("x", i.to_string()));
         }
         assert_eq!(inbox.unreadable(), 100);
-        let mut told = 0;
+        let mut reported = 0;
         while inbox.next(Duration::ZERO, |_| false).is_err() {
-            told += 1;
+            reported += 1;
         }
-        assert_eq!(told, MAX_ERRORS);
+        assert_eq!(reported, MAX_ERRORS);
     }
 }

@@ -1,16 +1,19 @@
-//! The key space.
+//! Key space: labels of topics, queries and liveliness tokens. A label is the part of a key behind `flyrig/v1/RIG/`.
 
 use flyrig_types::CameraId;
 
-use crate::{SCHEMA_VERSION, TransportError};
+use crate::{error::TransportError, schema::SCHEMA_VERSION};
 
-/// Views of this name's beginning belong to one subscriber.
+/// Prefix of the names of views that belong to one subscriber.
 pub(crate) const VIEWER_PREFIX: &str = "viewer-";
 
-/// Largest length of a name in a key, bytes.
+/// Largest number of people, besides the first, with topics at a time; beyond it the person published least recently loses its topics.
+pub const MAX_PERSON_TOPICS: usize = 16;
+
+/// Longest name in a key, bytes.
 const MAX_NAME: usize = 64;
 
-/// Whether a name can stand in a key.
+/// Checks that a name can be part of a key.
 pub(crate) fn check_name(what: &str, name: &str) -> Result<(), TransportError> {
     let good = |b: u8| b.is_ascii_alphanumeric() || matches!(b, b'_' | b'.' | b'-');
     if (1..=MAX_NAME).contains(&name.len()) && name.bytes().all(good) {
@@ -22,12 +25,12 @@ pub(crate) fn check_name(what: &str, name: &str) -> Result<(), TransportError> {
     ))
 }
 
-/// `flyrig/v1/<rig>/<rest>`.
+/// Returns the key `flyrig/v1/<rig>/<rest>`.
 pub(crate) fn key(rig: &str, rest: &str) -> String {
     format!("flyrig/v{SCHEMA_VERSION}/{rig}/{rest}")
 }
 
-/// Last parts of the key where a view's images go.
+/// Returns the label of a view's images.
 pub(crate) fn view_label(name: &str) -> String {
     match name.strip_prefix(VIEWER_PREFIX) {
         Some(subscriber) => format!("viewer/{subscriber}/view"),
@@ -35,34 +38,34 @@ pub(crate) fn view_label(name: &str) -> String {
     }
 }
 
-/// Labels of the splats of others than the first person begin so.
+/// Prefix of the labels of splats of all people but the first.
 pub(crate) const PERSON_SPLATS: &str = "splats/";
 
-/// Last parts of the key where a person's splats go; the first person's are where a rig of one person has them.
+/// Returns the label of a person's splats; that of the first person is the label of a rig with one person.
 pub(crate) fn splats_label(person: u32) -> String {
     if person == 0 { "splats".to_owned() } else { format!("{PERSON_SPLATS}{person}") }
 }
 
-/// Labels of the person stream begin so.
+/// Prefix of the labels of the person stream.
 pub(crate) const PERSON: &str = "person/";
 
-/// Last parts of the key where a person's motion goes.
+/// Returns the label of a person's motion.
 pub(crate) fn motion_label(person: u32) -> String {
     format!("{PERSON}{person}/{MOTION}")
 }
 
-/// Last part of the keys of motion.
+/// Last part of the labels of motion.
 pub(crate) const MOTION: &str = "motion";
 
-/// Last part of the keys of layers of colours, before the layer's number.
+/// Last part of the labels of colour layers, before the number of the layer.
 pub(crate) const COLOR: &str = "color-";
 
-/// Last parts of the key where a layer of a person's colours goes.
+/// Returns the label of a layer of a person's colours.
 pub(crate) fn color_label(person: u32, layer: usize) -> String {
     format!("{PERSON}{person}/{COLOR}{layer}")
 }
 
-/// The person that a label of the person stream names, and the layer of a label of colours; None for any other label.
+/// Returns the person that a label of the person stream names, and the layer of a label of colours; `None` for any other label.
 pub(crate) fn person_in(label: &str) -> Option<(u32, Option<usize>)> {
     let person: u32 = label.strip_prefix(PERSON)?.split('/').next()?.parse().ok()?;
     if label == motion_label(person) {
@@ -71,65 +74,65 @@ pub(crate) fn person_in(label: &str) -> Option<(u32, Option<usize>)> {
     (0..flyrig_stream::LAYERS).find(|layer| label == color_label(person, *layer)).map(|layer| (person, Some(layer)))
 }
 
-/// Whether a label belongs, or claims to belong, to the person stream.
+/// Returns whether a label belongs, or claims to belong, to the person stream.
 pub(crate) fn is_person(label: &str) -> bool {
     label.starts_with(PERSON)
 }
 
-/// Last parts of the key where a chunk of a template is asked for.
+/// Returns the label under which a chunk of a template is queried.
 pub(crate) fn chunk_label(hash: u64, chunk: u32) -> String {
     format!("template/{hash:016x}-{chunk}")
 }
 
-/// Hash and chunk of such a label.
+/// Returns hash and chunk number of such a label.
 pub(crate) fn chunk_in(label: &str) -> Option<(u64, u32)> {
     let (hash, chunk) = label.strip_prefix("template/")?.split_once('-')?;
     Some((u64::from_str_radix(hash, 16).ok()?, chunk.parse().ok()?))
 }
 
-/// Whether a label is that of splats.
+/// Returns whether a label is that of splats.
 pub(crate) fn is_splats(label: &str) -> bool {
     label == "splats" || label.starts_with(PERSON_SPLATS)
 }
 
-/// Liveliness of publishers of any schema version.
+/// Returns the key expression of the liveliness of publishers of any schema version.
 pub(crate) fn any_version_alive(rig: &str) -> String {
     format!("flyrig/*/{rig}/alive/*")
 }
 
-/// Labels of a camera's status begin so.
+/// Prefix of the labels of camera status.
 pub(crate) const STATUS: &str = "camera-status/";
 
-/// Last parts of the key where a camera's images go.
+/// Returns the label of a camera's images.
 pub(crate) fn frames_label(camera: &CameraId) -> String {
     format!("camera/{camera}")
 }
 
-/// Last parts of the key where a camera's status goes.
+/// Returns the label of a camera's status.
 pub(crate) fn status_label(camera: &CameraId) -> String {
     format!("{STATUS}{camera}")
 }
 
-/// Liveliness of computers with cameras, of any rig and schema version.
+/// Key expression of the liveliness of computers with cameras, of any rig and schema version.
 pub(crate) const ANY_HOST: &str = "flyrig/*/*/host/*";
 
-/// The rig that a key names.
+/// Returns the rig that a key names.
 pub(crate) fn rig_in(key: &str) -> Option<&str> {
     key.strip_prefix("flyrig/")?.split('/').nth(1)
 }
 
-/// The part of a key behind version and rig.
+/// Returns the label of a key: the part behind version and rig.
 pub(crate) fn label_in(key: &str) -> Option<&str> {
     key.strip_prefix("flyrig/")?.splitn(3, '/').nth(2)
 }
 
-/// The part of a key that `*` stands for in `<before>/*<after>`.
+/// Returns the part of a key that `*` matches in `<before>/*<after>`.
 pub(crate) fn name_in<'a>(key: &'a str, before: &str, after: &str) -> Option<&'a str> {
     let name = label_in(key)?.strip_prefix(before)?.strip_prefix('/')?.strip_suffix(after)?;
     (!name.is_empty() && !name.contains('/')).then_some(name)
 }
 
-/// The version that a key states, as it is written.
+/// Returns the version that a key states, as written.
 pub(crate) fn version_in(key: &str) -> Option<&str> {
     key.strip_prefix("flyrig/")?.split('/').next()
 }

@@ -1,18 +1,25 @@
-//! Text of other programs, made safe for terminals and logs.
+//! Escaping of text from other programs for terminals and logs.
 
 use std::borrow::Cow;
 
 /// Longest text that [`printable`] returns, characters.
 pub const MAX_PRINTABLE: usize = 500;
 
-/// Stands at the end of a text that was cut.
+/// Ending of a text that was cut.
 const CUT: &str = "...";
 
-/// Escapes what a terminal would obey instead of showing, and cuts the text at [`MAX_PRINTABLE`] characters.
+/// Escapes characters that a terminal would obey instead of showing, and cuts the text at [`MAX_PRINTABLE`] characters.
 ///
 /// Control characters (C0, delete, C1, and with them all ANSI escape sequences), line separators, and the marks that
 /// reorder text (U+061C, U+200E, U+200F, U+202A to U+202E, U+2066 to U+2069) become `\n`, `\u{1b}` and the like. Other
-/// text comes back as it is; escaping twice changes nothing.
+/// text is returned unchanged; escaping twice changes nothing.
+///
+/// ```
+/// use flyrig_transport::printable;
+///
+/// assert_eq!(printable("left\x1b[2J"), "left\\u{1b}[2J");
+/// assert_eq!(printable("camera 'left'"), "camera 'left'");
+/// ```
 #[must_use]
 pub fn printable(text: &str) -> Cow<'_, str> {
     let is_short = text.len() <= MAX_PRINTABLE || text.chars().nth(MAX_PRINTABLE).is_none();
@@ -40,7 +47,7 @@ pub fn printable(text: &str) -> Cow<'_, str> {
     Cow::Owned(shown)
 }
 
-/// [`printable`] in place.
+/// Applies [`printable`] in place.
 pub(crate) fn clean(text: &mut String) {
     if let Cow::Owned(safe) = printable(text) {
         *text = safe;

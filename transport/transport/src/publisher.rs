@@ -1,4 +1,4 @@
-//! The rig's side.
+//! Publisher: the rig's side.
 
 use std::{
     collections::BTreeSet,
@@ -8,53 +8,68 @@ use std::{
 };
 
 use flyrig_access::{Gate, Role};
-use flyrig_stream::Stamp;
+use flyrig_stream::{SplatState, Stamp};
 use flyrig_types::{Rig, ThreadHealth};
 use prost::bytes::Bytes;
 use zenoh::{Wait, liveliness::LivelinessToken, query::Query, sample::SampleKind};
 
 use crate::{
-    Header, MessageKind, PersonMessage, Received, RigStats, SplatState, TransportConfig, TransportError, ViewFrame,
-    Viewpoint,
-    calibration::{encode_calibration, encode_transforms},
-    config::LARGEST_QUESTION,
-    drain::{Drain, DrainThread, Retained, Shared, empty_header},
-    keys::{self, VIEWER_PREFIX},
-    people::{People, answer_templates},
-    printable,
-    session::{self, Opened},
-    splats::MAX_PERSON_TOPICS,
-    stats::{MAX_JSON_BYTES, from_json, to_json},
+    cameras::calibration::{encode_calibration, encode_transforms},
+    drain::{Drain, DrainThread, PublisherState, Retained},
+    error::TransportError,
+    header::{Header, MessageKind, empty_header},
+    json::{MAX_JSON_BYTES, from_json, to_json},
+    keys::{self, MAX_PERSON_TOPICS, VIEWER_PREFIX},
+    people::person_stream::{PersonMessage, PublishedPeople, answer_templates},
+    printable::printable,
+    session::{
+        config::{LARGEST_QUESTION, TransportConfig},
+        opening::{self, Opened},
+    },
+    stats::RigStats,
+    subscriber::Received,
     topic::{Body, PublishOutcome, Topic, TopicCounts, lock},
-    viewpoint::Leases,
+    views::{
+        view::ViewFrame,
+        viewpoint::{Leases, Viewpoint},
+    },
 };
 
-/// Most views of a rig, those of viewers not counted.
+/// Largest number of views of a rig, those of viewers not counted.
 const MAX_VIEWS: usize = 64;
 
 /// Counts of viewpoint requests since the start.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]
 pub struct ViewpointCounts {
-    /// Now.
+    /// Viewpoints whose lease runs now.
     pub active: usize,
-    /// New ones granted (renewals do not count).
+    /// Viewpoints granted, renewals not counted.
     pub granted: u64,
-    /// Requests refused.
+    /// Number of requests refused.
     pub refused: u64,
-    /// Ended by their lease, because the subscriber went away, or because they could not be drawn.
+    /// Viewpoints that ended: the lease ran out, the subscriber left, or they could not be drawn.
     pub expired: u64,
 }
 
-/// Publishes a rig; no method waits for the network once it is open.
+/// Publisher of a rig; once open, no method waits for the network.
+///
+/// ```no_run
+/// use flyrig_transport::{Publisher, RigStats, TransportConfig};
+///
+/// let publisher = Publisher::open(&TransportConfig::publisher("studio"))?;
+/// publisher.publish_stats(&RigStats { frame: 1, frames_per_second: 30.0, ..RigStats::default() })?;
+/// publisher.close()?;
+/// # Ok::<(), flyrig_transport::TransportError>(())
+/// ```
 pub struct Publisher {
-    shared: Arc<Shared>,
+    shared: Arc<PublisherState>,
     splats: Arc<Topic>,
-    /// Splats of other persons than the first, the one that was published last at the end.
+    /// Splat topics of all people but the first, most recently published last.
     persons: Mutex<Vec<(u32, Arc<Topic>)>>,
-    people: Arc<People>,
+    people: Arc<PublishedPeople>,
     stats: Arc<Topic>,
     endpoints: Vec<String>,
-    /// Admits holders of keys.
+    /// Gate that admits holders of keys.
     gate: Option<Gate>,
     drain: DrainThread,
     _alive: LivelinessToken,
@@ -78,17 +93,17 @@ impl Publisher {
         config.validate()?;
         let rig = &config.rig;
         let Opened { session, endpoints, gate } =
-            session::open(config, LARGEST_QUESTION, &[Role::Viewer, Role::Relay])?;
+            opening::open(config, LARGEST_QUESTION, &[Role::Viewer, Role::Relay])?;
         let failed = |error: zenoh::Error| TransportError::session(format!("publisher of rig {rig}"), &error);
 
         let splats = Arc::new(Topic::new("splats".to_owned(), "splats".to_owned(), MessageKind::Splats));
         let stats = Arc::new(Topic::new("stats".to_owned(), "stats".to_owned(), MessageKind::Stats));
         let lease = Duration::from_millis(config.viewpoint_lease_millis);
         let leases = Leases::new(config.max_viewers, lease, config.viewpoint_pixels_per_second);
-        let people = Arc::new(People::new());
+        let people = Arc::new(PublishedPeople::new());
         let mut topics = vec![splats.clone(), stats.clone()];
         topics.extend(people.first_topics());
-        let (shared, woken) = Shared::new(rig, &session, &topics, leases);
+        let (shared, woken) = PublisherState::new(rig, &session, &topics, leases);
 
         let state = shared.clone();
         session
@@ -125,19 +140,19 @@ impl Publisher {
         Ok(Self { shared, splats, persons, people, stats, endpoints, gate, drain, _alive: alive })
     }
 
-    /// Endpoints it listens on, port 0 replaced by the real one.
+    /// Returns the endpoints that it listens on, port 0 replaced by the actual one.
     #[must_use]
     pub fn endpoints(&self) -> &[String] {
         &self.endpoints
     }
 
-    /// Address where holders of keys connect; None without keys.
+    /// Returns the address where holders of keys connect; `None` without keys.
     #[must_use]
     pub fn gate(&self) -> Option<SocketAddr> {
         self.gate.as_ref().map(Gate::address)
     }
 
-    /// Makes a view known so that subscribers of it are noticed before its first image.
+    /// Registers a view, so that its subscribers are noticed before its first image.
     ///
     /// # Errors
     /// `Config` for a bad name or more than 64 views.
@@ -145,20 +160,19 @@ impl Publisher {
         self.view_topic(view).map(|_| ())
     }
 
-    /// Whether anybody subscribes to a view that was added or published, or to a requested viewpoint's
-    /// view; at most some 50 ms old.
+    /// Returns whether a view that was added or published, or that of a requested viewpoint, has subscribers; up to about 50 ms old.
     #[must_use]
     pub fn has_subscribers(&self, view: &str) -> bool {
         lock(&self.shared.topics).get(&keys::view_label(view)).is_some_and(|topic| topic.is_watched())
     }
 
-    /// Whether anybody subscribes to the splats (of the first person; a [`crate::Subscriber`] takes those of all).
+    /// Returns whether the splats of the first person have subscribers; a [`crate::Subscriber`] takes those of all people.
     #[must_use]
     pub fn has_splat_subscribers(&self) -> bool {
         self.splats.is_watched()
     }
 
-    /// Hands in an image.
+    /// Hands in an image of a view.
     ///
     /// # Errors
     /// `Config` for a bad name, size or more than 64 views.
@@ -175,8 +189,8 @@ impl Publisher {
         Ok(self.offer(&topic, Body::View(frame), header))
     }
 
-    /// Hands in a person's splat state; it is encoded on the publisher thread. Each person has a slot of its own; the first
-    /// state of a new one is [`PublishOutcome::Unwatched`], since nobody could subscribe yet.
+    /// Hands in the splat state of a person; the publisher thread encodes it. Each person has a slot of its own; the first state of a
+    /// new person is [`PublishOutcome::Unwatched`], since it could not be subscribed to yet.
     pub fn publish_splats(&self, state: Arc<SplatState>) -> PublishOutcome {
         let header = Header { frame: state.frame, capture_nanos: state.capture_nanos, ..empty_header() };
         let topic = match state.person {
@@ -186,25 +200,24 @@ impl Publisher {
         self.offer(&topic, Body::Splats(state), header)
     }
 
-    /// Whether anybody subscribes to the person stream.
+    /// Returns whether the person stream has subscribers.
     #[must_use]
     pub fn has_person_subscribers(&self) -> bool {
         self.people.is_watched()
     }
 
-    /// Keeps a person's template for those who ask for it; one of the last [`MAX_PERSON_TOPICS`] + 1 persons.
+    /// Keeps the template of a person for viewers that query it; those of the last [`MAX_PERSON_TOPICS`] + 1 people are kept.
     pub fn offer_template(&self, person: u32, hash: u64, bytes: Bytes) {
         self.people.offer_template(person, hash, bytes);
     }
 
-    /// Hands in a message of the person stream: motion, or a layer of the colours. One of the same kind that still waits is
-    /// replaced.
+    /// Hands in a message of the person stream: motion, or a layer of colours. It replaces a waiting one of the same kind.
     pub fn publish_person(&self, stamp: &Stamp, layer: Option<usize>, bytes: Bytes) -> PublishOutcome {
         let header = Header { frame: stamp.frame, capture_nanos: stamp.capture_nanos, ..empty_header() };
         self.offer_person(stamp.person, layer, bytes, header)
     }
 
-    /// Hands in a message of the person stream of another publisher, with its times.
+    /// Hands in a message of another publisher's person stream with its original times.
     pub(crate) fn pass_on(&self, received: Received<PersonMessage>) -> PublishOutcome {
         let PersonMessage { person, layer, bytes } = received.body;
         self.offer_person(person, layer, bytes, received.header)
@@ -244,11 +257,10 @@ impl Publisher {
         Ok(self.offer(&self.stats, Body::Bytes(Bytes::from(stats.encode()?)), header))
     }
 
-    /// Sets the calibration; it is sent when a first subscriber comes, and then once a second for
-    /// those who come later.
+    /// Sets the calibration; it is sent to the first subscriber, and once per second for later ones.
     ///
     /// # Errors
-    /// `Config` when the rig is not valid or a camera's name cannot stand in a key.
+    /// `Config` when the rig is not valid or a camera's name cannot be part of a key.
     pub fn set_calibration(&self, rig: &Rig) -> Result<(), TransportError> {
         let topic = |label: String, kind| Arc::new(Topic::new(label.clone(), label, kind));
         let transforms = topic("transforms".to_owned(), MessageKind::Transforms);
@@ -267,7 +279,7 @@ impl Publisher {
         Ok(())
     }
 
-    /// Viewpoints whose lease runs.
+    /// Returns the viewpoints whose lease runs.
     #[must_use]
     pub fn requested_viewpoints(&self) -> Vec<Viewpoint> {
         let mut leases = lock(&self.shared.leases);
@@ -275,8 +287,8 @@ impl Publisher {
         leases.viewpoints()
     }
 
-    /// Viewpoints to draw for the frame set at `now`: those that are watched and whose last image is a period of their
-    /// `max_fps` old. Each is taken: its next image is due a period later, so call this once a frame set.
+    /// Takes the viewpoints to draw for the frame set at `now`: those that are watched and whose last image is a period of their
+    /// `max_fps` old. The next image of each is due a period later, so call this once per frame set.
     #[must_use]
     pub fn due_viewpoints(&self, now: Instant) -> Vec<Viewpoint> {
         let watched = |topic: &&Arc<Topic>| topic.is_watched() && topic.name.starts_with(VIEWER_PREFIX);
@@ -285,21 +297,21 @@ impl Publisher {
         lock(&self.shared.leases).take_due(now, |view| watched.contains(view))
     }
 
-    /// Sets the pixels of the largest viewpoint that the rig can draw; larger ones end, and are refused in words. No limit
-    /// at first.
+    /// Sets the largest viewpoint that the rig can draw, pixels; larger ones end, and are refused with a reason. There is no limit at
+    /// first.
     pub fn set_max_view_pixels(&self, pixels: u64) {
         lock(&self.shared.leases).set_max_view_pixels(pixels);
         self.shared.sync_viewer_topics();
     }
 
-    /// Ends the viewpoint of a subscriber that could not be drawn. The same request is refused for a minute with this
-    /// reason; another camera or rate is tried again.
+    /// Ends the viewpoint of a subscriber because it could not be drawn. The same request is refused with this reason for a minute;
+    /// another camera or rate is tried again.
     pub fn refuse_viewpoint(&self, subscriber: &str, reason: &str) {
         lock(&self.shared.leases).refuse(subscriber, reason, Instant::now());
         self.shared.sync_viewer_topics();
     }
 
-    /// Counts of viewpoint requests.
+    /// Returns the counts of viewpoint requests.
     #[must_use]
     pub fn viewpoint_counts(&self) -> ViewpointCounts {
         let leases = lock(&self.shared.leases);
@@ -311,19 +323,20 @@ impl Publisher {
         }
     }
 
-    /// Counts a topic: `view/NAME`, `viewer/SUBSCRIBER/view`, `splats`, `splats/PERSON`, `stats`, `calibration/CAMERA`, `transforms`.
+    /// Returns the counts of each topic: `view/NAME`, `viewer/SUBSCRIBER/view`, `splats`, `splats/PERSON`, `stats`,
+    /// `calibration/CAMERA`, `transforms`.
     #[must_use]
     pub fn counts(&self) -> Vec<(String, TopicCounts)> {
         lock(&self.shared.topics).iter().map(|(label, topic)| (label.clone(), topic.counts())).collect()
     }
 
-    /// Returns the health of the thread that sends.
+    /// Returns the health of the publisher thread.
     #[must_use]
     pub fn thread(&self) -> ThreadHealth {
         self.drain.health()
     }
 
-    /// Ends the thread and the session; dropping does the same but says nothing.
+    /// Ends the thread and the session; dropping does the same without reporting errors.
     ///
     /// # Errors
     /// `Session` when the thread died or zenoh fails to close.
@@ -339,7 +352,7 @@ impl Publisher {
         outcome
     }
 
-    /// `None` for the view of a viewer whose lease has ended.
+    /// Returns the topic of a view; `None` for the view of a viewer whose lease has ended.
     fn view_topic(&self, view: &str) -> Result<Option<Arc<Topic>>, TransportError> {
         let label = keys::view_label(view);
         let mut topics = lock(&self.shared.topics);
@@ -360,11 +373,11 @@ impl Publisher {
     }
 }
 
-/// Runs on a zenoh thread: short, no waiting.
-fn answer_viewpoint(shared: &Shared, query: &Query) {
+/// Answers a request for a viewpoint; runs on a zenoh thread, so it is short and never waits.
+fn answer_viewpoint(shared: &PublisherState, query: &Query) {
     let key = query.key_expr().as_str();
     let Some(subscriber) = keys::name_in(key, "viewpoint", "") else { return };
-    // What is too long is not even copied, and refused as empty.
+    // A payload that is too long is not even copied, and refused as empty.
     let payload = query.payload().filter(|payload| payload.len() <= MAX_JSON_BYTES);
     let payload = payload.map(zenoh::bytes::ZBytes::to_bytes).unwrap_or_default();
     let answer = lock(&shared.leases).ask(subscriber, from_json(key, &payload), Instant::now());

@@ -1,47 +1,47 @@
-//! Rates, gaps and latencies of what comes in.
+//! Rates, gaps and latencies of received messages.
 
 use std::{collections::VecDeque, time::Instant};
 
-use crate::Header;
+use crate::header::Header;
 
-/// Messages over which rates and latencies are taken.
+/// Number of messages over which rates and latencies are computed.
 const WINDOW: usize = 256;
 
-/// Latencies of the last messages (at most 256).
+/// Latencies of the last 256 messages.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct LatencyReport {
     /// Median, milliseconds.
     pub p50_millis: f64,
-    /// 99 of 100 are below, milliseconds.
+    /// 99th percentile, milliseconds.
     pub p99_millis: f64,
     /// Longest, milliseconds.
     pub max_millis: f64,
-    /// Whether all came from this host; if not, the difference of the hosts' clocks is inside.
+    /// Whether all came from this host; otherwise latencies include the offset between the hosts' clocks.
     pub is_exact: bool,
 }
 
-/// What came in on one topic since the start.
+/// Statistics of one topic since the start.
 #[derive(Debug, Clone, Default, PartialEq)]
 pub struct TopicReport {
-    /// Messages.
+    /// Messages received.
     pub received: u64,
     /// Payload bytes.
     pub bytes: u64,
-    /// Messages that the publisher handed in but that never came, by gaps of the sequence.
+    /// Messages that were published but never arrived, by gaps of the sequence.
     pub missed: u64,
-    /// Messages that a newer one replaced before we were asked for them.
+    /// Messages replaced by a newer one before they were read.
     pub replaced: u64,
-    /// Messages that were dropped before we were asked for them because too many bytes waited over all topics.
+    /// Messages dropped before they were read, because too many bytes waited over all topics.
     pub dropped: u64,
-    /// How often the sequence began anew: the publisher restarted, or set the topic up again.
+    /// Number of restarts of the sequence: the publisher restarted, or set the topic up again.
     pub restarts: u64,
-    /// Messages a second, over the last ones (at most 256).
+    /// Messages per second, over the last 256.
     pub per_second: f64,
-    /// Latency, once something came.
+    /// Latency, once a message has arrived.
     pub latency: Option<LatencyReport>,
 }
 
-/// Collects a [`TopicReport`].
+/// Collector of a [`TopicReport`].
 #[derive(Debug, Default)]
 pub(crate) struct Tally {
     pub totals: TopicReport,
@@ -57,7 +57,7 @@ impl Tally {
             Some((publisher, sequence)) if publisher == header.publisher && header.sequence > sequence => {
                 self.totals.missed = self.totals.missed.saturating_add(header.sequence - sequence - 1);
             }
-            // Another publisher, or a sequence that does not grow: TCP keeps the order, so it began anew.
+            // Another publisher, or a sequence that does not grow: TCP preserves the order, so it restarted.
             Some(_) => {
                 self.totals.restarts += 1;
                 self.window.clear();
@@ -98,7 +98,7 @@ mod tests {
     use std::time::Duration;
 
     use super::*;
-    use crate::drain::empty_header;
+    use crate::header::empty_header;
 
     #[test]
     fn gaps_restarts_rates_and_latencies_of_a_hand_made_stream() {

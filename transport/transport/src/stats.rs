@@ -1,18 +1,18 @@
-//! The rig's own figures, JSON.
+//! Statistics of the rig, JSON.
 
 use std::collections::BTreeMap;
 
 use serde::{Deserialize, Serialize};
 
-use crate::{SCHEMA_VERSION, TransportError, printable, printable::clean};
+use crate::{
+    error::TransportError,
+    json::{from_json, to_json},
+    printable::{clean, printable},
+};
 
-/// Largest JSON payload that is looked at, bytes.
-pub(crate) const MAX_JSON_BYTES: usize = 1 << 18;
-
-/// Time a stage of the pipeline takes.
+/// Run time of a stage of the pipeline.
 ///
-/// On the wire the percentile also stands as `max_millis`, its name before, so that older and newer programs read each
-/// other.
+/// On the wire the percentile is repeated under its former name `max_millis`, so that older and newer programs read each other.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(from = "WireStageStats", into = "WireStageStats")]
 pub struct StageStats {
@@ -45,132 +45,94 @@ impl From<StageStats> for WireStageStats {
     }
 }
 
-/// What a view costs.
+/// Output rate of a view.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct ViewRate {
     /// Name of the view.
     pub view: String,
-    /// Images a second.
+    /// Images per second.
     pub per_second: f64,
-    /// Bytes a second.
+    /// Bytes per second.
     pub bytes_per_second: f64,
 }
 
-/// How well the person is followed, at the last frame.
+/// Tracking quality of the first person at the last frame.
 #[derive(Debug, Clone, Default, PartialEq, Serialize, Deserialize)]
 pub struct TrackingStats {
-    /// "searching", "first", "steady", "recovering" or "lost".
+    /// State: "searching", "first", "steady", "recovering" or "lost".
     pub state: String,
-    /// How much of the person is where the images show it, 0 to 1; none when nothing was compared.
+    /// Fraction of the person that agrees with the images, 0 to 1; `None` when nothing was compared.
     pub quality: Option<f64>,
-    /// The same by camera; one that is covered is near 0.
+    /// Fraction that agrees in each camera; near 0 for a camera that is covered.
     pub cameras: BTreeMap<String, f64>,
 }
 
-/// How well one person is followed, at the last frame.
+/// Tracking quality of one person at the last frame.
 #[derive(Debug, Clone, Default, PartialEq, Serialize, Deserialize)]
 pub struct SubjectStats {
-    /// Which person, as in [`crate::SplatState::person`]; 0 is the first.
+    /// Number of the person as in [`flyrig_stream::SplatState::person`]; 0 is the first.
     pub person: u32,
-    /// As [`TrackingStats::state`].
+    /// State as in [`TrackingStats::state`].
     pub state: String,
-    /// As [`TrackingStats::quality`].
+    /// Quality as in [`TrackingStats::quality`].
     pub quality: Option<f64>,
-    /// As [`TrackingStats::cameras`].
+    /// Fractions as in [`TrackingStats::cameras`].
     pub cameras: BTreeMap<String, f64>,
 }
 
-/// Effort of a rig with a budget of time.
+/// Effort of a rig with a time budget.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Serialize, Deserialize)]
 pub struct BudgetStats {
-    /// Sets a second that are wanted.
+    /// Target rate, frame sets per second.
     pub fps: f64,
-    /// Level of effort: 0 with all the work.
+    /// Level of effort; 0 does all the work.
     pub level: u32,
     /// Number of levels.
     pub levels: u32,
-    /// Smoothed cost of a set, seconds.
+    /// Smoothed cost of a frame set, seconds.
     pub set_secs: f64,
 }
 
-/// How the rig is doing over its last interval (about a second).
+/// Statistics of the rig over its last interval of about a second.
 #[derive(Debug, Clone, Default, PartialEq, Serialize, Deserialize)]
 pub struct RigStats {
-    /// The rig's frame number.
+    /// Frame number of the rig.
     pub frame: u64,
-    /// Time of the frame by the cameras' clock: `CLOCK_MONOTONIC` of the capturing host, or a clock of their own for recorded and simulated
-    /// cameras.
+    /// Capture time of the frame: `CLOCK_MONOTONIC` of the capturing host, or the own clock of recorded and simulated cameras.
     pub capture_nanos: i64,
-    /// `CLOCK_MONOTONIC` minus the cameras' clock, nanoseconds, by the set that came soonest after its capture; `None` where sets are taken in
-    /// at another pace than they were captured, and from older programs.
+    /// `CLOCK_MONOTONIC` minus the cameras' clock, nanoseconds, estimated from the frame set with the shortest delay; `None` where frame
+    /// sets are ingested at another pace than they were captured, and from older programs.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub clock_offset_nanos: Option<i64>,
-    /// Since the rig started, seconds.
+    /// Time since the rig started, seconds.
     pub uptime_secs: f64,
-    /// Frame sets a second through the whole pipeline.
+    /// Frame sets per second through the whole pipeline.
     pub frames_per_second: f64,
-    /// In the order of the pipeline.
+    /// Stages in the order of the pipeline.
     pub stages: Vec<StageStats>,
-    /// Frames lost since the start, by place.
+    /// Number of frames lost since the start at each place of the pipeline.
     pub dropped: BTreeMap<String, u64>,
-    /// Published views.
+    /// Rates of the published views.
     pub views: Vec<ViewRate>,
-    /// Subscribers with a viewpoint of their own.
+    /// Number of subscribers with a viewpoint of their own.
     pub viewers: u32,
     /// Level of effort; `None` without a budget, and from older programs.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub budget: Option<BudgetStats>,
-    /// The first of `subjects`, for programs that know one person. [`Self::encode`] fills it in from `subjects`, or
-    /// `subjects` from it where that is empty; so does [`Self::decode`] with what an older program sent.
+    /// Tracking quality of the first of `subjects`, for programs that know one person. [`Self::encode`] fills it in from `subjects`, or
+    /// `subjects` from it where that is empty; [`Self::decode`] does so with messages of older programs.
     #[serde(default)]
     pub tracking: TrackingStats,
-    /// How well each person is followed.
+    /// Tracking quality of each person.
     #[serde(default)]
     pub subjects: Vec<SubjectStats>,
 }
 
-/// JSON with the version first, so that a reader can tell before it understands the rest.
-#[derive(Serialize)]
-struct Versioned<'a, T> {
-    schema_version: u16,
-    #[serde(flatten)]
-    body: &'a T,
-}
-
-#[derive(Deserialize)]
-struct VersionOnly {
-    schema_version: u64,
-}
-
-/// JSON bytes of a message with its schema version.
-pub(crate) fn to_json<T: Serialize>(topic: &str, body: &T) -> Result<Vec<u8>, TransportError> {
-    let bytes = serde_json::to_vec(&Versioned { schema_version: SCHEMA_VERSION, body })
-        .map_err(|error| TransportError::config(topic, error.to_string()))?;
-    if bytes.len() > MAX_JSON_BYTES {
-        return Err(TransportError::config(topic, format!("{} bytes of JSON, at most {MAX_JSON_BYTES}", bytes.len())));
-    }
-    Ok(bytes)
-}
-
-/// Message out of JSON bytes of our schema version.
-pub(crate) fn from_json<T: serde::de::DeserializeOwned>(topic: &str, bytes: &[u8]) -> Result<T, TransportError> {
-    if bytes.len() > MAX_JSON_BYTES {
-        let len = bytes.len();
-        return Err(TransportError::malformed(topic, format!("{len} bytes of JSON, at most {MAX_JSON_BYTES}")));
-    }
-    let refuse = |error: serde_json::Error| TransportError::malformed(topic, error.to_string());
-    let version: VersionOnly = serde_json::from_slice(bytes).map_err(refuse)?;
-    if version.schema_version != u64::from(SCHEMA_VERSION) {
-        return Err(TransportError::version(topic, version.schema_version));
-    }
-    serde_json::from_slice(bytes).map_err(refuse)
-}
-
 impl RigStats {
-    /// As JSON.
+    /// Encodes the statistics as JSON.
     ///
     /// # Errors
-    /// `Config` when a figure is NaN or infinite (JSON has no form for them) or it is over 256 KiB.
+    /// `Config` when a figure is NaN or infinite (JSON has no form for them) or the text is longer than 256 KiB.
     pub fn encode(&self) -> Result<Vec<u8>, TransportError> {
         let stats = self.clone().with_subjects();
         let figures_of = |subject: &SubjectStats| {
@@ -187,7 +149,7 @@ impl RigStats {
         to_json("stats", &stats)
     }
 
-    /// Out of JSON; all names are [`printable`].
+    /// Decodes statistics from JSON; all names are made [`printable()`].
     ///
     /// # Errors
     /// `UnknownVersion` or `Malformed`.
@@ -205,7 +167,7 @@ impl RigStats {
         Ok(stats.with_subjects())
     }
 
-    /// Lets `tracking` and the first subject say the same.
+    /// Makes `tracking` and the first subject agree.
     fn with_subjects(mut self) -> Self {
         match self.subjects.first().cloned() {
             Some(SubjectStats { state, quality, cameras, .. }) => {
@@ -230,7 +192,7 @@ fn clean_keys<T>(map: &mut BTreeMap<String, T>) {
 mod tests {
     use super::*;
 
-    /// As a program without `subjects` and `p95_millis` reads it.
+    /// Statistics as a program without `subjects` and `p95_millis` reads them.
     #[derive(Deserialize)]
     struct OldStats {
         stages: Vec<OldStage>,

@@ -1,73 +1,96 @@
-//! The watcher's side.
+//! Subscriber: the viewer's side.
 
 use std::{sync::Arc, time::Duration};
 
-use flyrig_access::Probe;
+use flyrig_access::KeyProbe;
+use flyrig_stream::{MAX_SPLAT_BYTES, SplatState};
 use flyrig_types::{Camera, Rig};
 use prost::bytes::Bytes;
 use zenoh::{Session, Wait, liveliness::LivelinessToken, sample::SampleKind};
 
 use crate::{
-    Header, RigStats, SplatState, TemplateFetcher, TopicReport, TransportConfig, TransportError, ViewFrame,
-    ViewpointStatus,
-    config::LARGEST_QUESTION,
+    error::TransportError,
+    header::Header,
     inbox::{Inbox, Raw, as_malformed},
     keys::{self, VIEWER_PREFIX},
-    people::{PersonMessage, PersonSubscription},
-    renewal::Renewal,
-    session::{self, Opened},
-    splats,
-    view::MAX_MESSAGE_BYTES,
-    viewpoint::check_camera,
+    people::{
+        person_stream::{PersonMessage, PersonSubscription},
+        template_fetcher::TemplateFetcher,
+    },
+    report::TopicReport,
+    session::{
+        config::{LARGEST_QUESTION, TransportConfig},
+        opening::{self, Opened},
+    },
+    stats::RigStats,
+    views::{
+        renewal::Renewal,
+        view::{MAX_MESSAGE_BYTES, ViewFrame},
+        viewpoint::{ViewpointStatus, check_camera},
+    },
 };
 
-/// Which views to receive.
+/// Selection of views to receive.
 #[derive(Debug, Clone, Default, PartialEq, Eq)]
 pub enum Views {
-    /// None.
+    /// No view.
     #[default]
     None,
-    /// Every view of the rig (not other subscribers' viewpoints).
+    /// Every view of the rig, without the viewpoints of other subscribers.
     All,
-    /// These.
+    /// Views of these names.
     Named(Vec<String>),
 }
 
-/// What to receive; the rest is not sent to us at all. Calibration always comes, a viewpoint when asked for.
+/// Selection of messages to receive; the others are not sent to this subscriber at all. Calibration always arrives, a viewpoint on
+/// request.
 #[derive(Debug, Clone, Default, PartialEq, Eq)]
 pub struct Interests {
-    /// Views.
+    /// Rendered views.
     pub views: Views,
-    /// The splat stream.
+    /// Whether to receive splat states.
     pub splats: bool,
-    /// The person stream: motion, and colours once a template has been fetched.
+    /// Whether to receive the person stream: motion, and colours once a template has been fetched.
     pub people: bool,
-    /// The rig's statistics.
+    /// Whether to receive the rig's statistics.
     pub stats: bool,
 }
 
-/// A message with what its header said.
+/// Received message with its header.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Received<T> {
-    /// Name of the view, else the topic.
+    /// Name of the view, otherwise the topic.
     pub topic: String,
-    /// Its header.
+    /// Header of the message.
     pub header: Header,
-    /// Publisher's hand-in to our receipt, by wall clocks; may be negative between hosts.
+    /// Time from the publisher's hand-in to the receipt here, by wall clocks; may be negative between hosts.
     pub latency_nanos: i64,
-    /// Whether both ends run on one host, so that the latency is exact (unless the clock is set meanwhile).
+    /// Whether both ends run on one host, so that the latency is exact unless the clock is set meanwhile.
     pub latency_is_exact: bool,
-    /// The message.
+    /// Decoded message.
     pub body: T,
 }
 
-/// Receives a rig; the newest message of a topic waits for its reader, older ones are replaced and counted.
+/// Subscriber of a rig; the newest message of each topic waits for its reader, older ones are replaced and counted.
+///
+/// ```no_run
+/// use std::time::Duration;
+///
+/// use flyrig_transport::{Interests, Subscriber, TransportConfig};
+///
+/// let interests = Interests { stats: true, ..Interests::default() };
+/// let subscriber = Subscriber::open(&TransportConfig::subscriber("studio"), &interests)?;
+/// if let Some(received) = subscriber.next_stats(Duration::from_secs(2))? {
+///     println!("{:.1} frame sets per second", received.body.frames_per_second);
+/// }
+/// # Ok::<(), flyrig_transport::TransportError>(())
+/// ```
 pub struct Subscriber {
     inbox: Arc<Inbox>,
     people: Arc<PersonSubscription>,
     id: String,
     renewal: Renewal,
-    probe: Option<Probe>,
+    probe: Option<KeyProbe>,
     session: Session,
     closed: bool,
     _alive: LivelinessToken,
@@ -80,7 +103,7 @@ impl std::fmt::Debug for Subscriber {
 }
 
 impl Subscriber {
-    /// Opens the session; the publisher may come later.
+    /// Opens the session; the publisher may start later.
     ///
     /// # Errors
     /// `Config` or `Session`.
@@ -88,8 +111,8 @@ impl Subscriber {
         config.validate()?;
         let rig = &config.rig;
         let failed = |error: zenoh::Error| TransportError::session(format!("subscriber of rig {rig}"), &error);
-        let largest = MAX_MESSAGE_BYTES.max(splats::MAX_BYTES) + LARGEST_QUESTION;
-        let Opened { session, .. } = session::open(config, largest, &[])?;
+        let largest = MAX_MESSAGE_BYTES.max(MAX_SPLAT_BYTES) + LARGEST_QUESTION;
+        let Opened { session, .. } = opening::open(config, largest, &[])?;
         let id = session.zid().to_string();
         let id = config.key.as_ref().map_or_else(|| id.clone(), |key| format!("{}.{id}", key.topic_name));
         let inbox = Arc::new(Inbox::new(format!("{VIEWER_PREFIX}{id}"), config.inbox_bytes));
@@ -134,7 +157,7 @@ impl Subscriber {
         let key = keys::key(rig, &format!("viewpoint/{id}"));
         let renewal = Renewal::start(session.clone(), key, format!("{VIEWER_PREFIX}{id}"))?;
         let connected = inbox.clone();
-        let probe = session::probe(config, move || connected.publishers() > 0)?;
+        let probe = opening::probe(config, move || connected.publishers() > 0)?;
         let people = Arc::new(PersonSubscription::new(&session, rig, &inbox));
         if interests.people {
             people.begin_motion()?;
@@ -142,23 +165,23 @@ impl Subscriber {
         Ok(Self { inbox, people, id, renewal, probe, session, closed: false, _alive: alive })
     }
 
-    /// Our name towards the publisher.
+    /// Returns the name of this subscriber towards the publisher.
     #[must_use]
     pub fn id(&self) -> &str {
         &self.id
     }
 
-    /// Name of the view that our own viewpoint arrives as.
+    /// Returns the name of the view under which the requested viewpoint arrives.
     #[must_use]
     pub fn viewpoint_view(&self) -> String {
         format!("{VIEWER_PREFIX}{}", self.id)
     }
 
-    /// The next image nobody has taken yet, of any view (views take turns); `None` after the timeout.
+    /// Takes the next waiting image of any view (views take turns); `None` after the timeout.
     ///
     /// # Errors
-    /// `UnknownVersion` or `Malformed`, once for each such message or publisher, whichever topic it was
-    /// on; it is fine to go on. After an error a message that waits comes first, so errors hold no message up.
+    /// `UnknownVersion` or `Malformed`, once for each such message or publisher of any topic; the subscriber stays usable. After an
+    /// error a waiting message comes first, so that errors delay no message.
     pub fn next_view(&self, timeout: Duration) -> Result<Option<Received<ViewFrame>>, TransportError> {
         let Some((label, raw)) = self.inbox.next(timeout, |label| self.inbox.view_name(label).is_some())? else {
             return Ok(None);
@@ -167,18 +190,17 @@ impl Subscriber {
         self.received(name, raw, ViewFrame::decode).map(Some)
     }
 
-    /// The newest splat state nobody has taken yet, of any person (persons take turns, see [`SplatState::person`]); `None`
-    /// after the timeout.
+    /// Takes the newest waiting splat state of any person (people take turns, see [`SplatState::person`]); `None` after the timeout.
     ///
     /// # Errors
     /// As [`Self::next_view`].
     pub fn next_splats(&self, timeout: Duration) -> Result<Option<Received<SplatState>>, TransportError> {
         let Some((label, raw)) = self.inbox.next(timeout, keys::is_splats)? else { return Ok(None) };
-        self.received(label, raw, |_, _, payload| SplatState::decode(&payload)).map(Some)
+        self.received(label, raw, |_, _, payload| Ok(SplatState::decode(&payload)?)).map(Some)
     }
 
-    /// The next message of the person stream that was not taken yet, topics in turns; `None` after the timeout. Take messages as
-    /// they come: only the newest of a topic waits. Layers of colours come and go here, see [`Self::color_layers`].
+    /// Takes the next waiting message of the person stream, topics in turns; `None` after the timeout. Call it often: only the newest
+    /// message of a topic waits. It also adapts the number of colour layers, see [`Self::color_layers`].
     ///
     /// # Errors
     /// As [`Self::next_view`].
@@ -189,16 +211,16 @@ impl Subscriber {
         self.received(label, raw, |_, _, bytes| Ok(PersonMessage { person, layer, bytes })).map(Some)
     }
 
-    /// Asks the rig for the bytes of the [`flyrig_stream::StreamTemplate`] that a motion's stamp names. Returns `None` when nobody
-    /// answers within `timeout`, and at once while no publisher is known that answers for templates; ask again then.
+    /// Queries the bytes of the [`flyrig_stream::StreamTemplate`] that a motion's stamp names. Returns `None` without an answer within
+    /// `timeout`, and at once while no publisher of templates is known; ask again then.
     ///
     /// # Errors
-    /// `Malformed` when the answer is not that template, `Session` when the question cannot be asked.
+    /// `Malformed` when the answer is not that template, `Session` when the query cannot be sent.
     pub fn template(&self, hash: u64, timeout: Duration) -> Result<Option<Vec<u8>>, TransportError> {
         self.people.ask_template(hash, timeout)
     }
 
-    /// Returns a fetcher of templates that works beside us.
+    /// Starts a fetcher of templates, which works in parallel to this subscriber.
     ///
     /// # Errors
     /// `Session` when no thread can be started.
@@ -206,7 +228,7 @@ impl Subscriber {
         TemplateFetcher::start(self.people.clone())
     }
 
-    /// The newest statistics nobody has taken yet; `None` after the timeout.
+    /// Takes the newest waiting statistics; `None` after the timeout.
     ///
     /// # Errors
     /// As [`Self::next_view`].
@@ -215,7 +237,7 @@ impl Subscriber {
         self.received(label, raw, |_, _, payload| RigStats::decode(&payload)).map(Some)
     }
 
-    /// The rig's cameras once all of them have come; waits at most `timeout` (may be zero).
+    /// Returns the rig once all of its cameras have arrived; waits at most `timeout`, which may be zero.
     ///
     /// # Errors
     /// As [`Self::next_view`].
@@ -223,60 +245,60 @@ impl Subscriber {
         self.inbox.rig(timeout)
     }
 
-    /// Asks for images through a camera of our own, or moves it; renewed until given back. The
-    /// images come with [`Self::next_view`] as the view [`Self::viewpoint_view`].
+    /// Requests images through a camera of this subscriber, or moves it; the lease is renewed until the viewpoint is released. The
+    /// images arrive through [`Self::next_view`] as the view [`Self::viewpoint_view`].
     ///
     /// # Errors
-    /// `Config` when the camera is not valid, larger than 4096 pixels a side, or `max_fps` is not in 0..=1000.
+    /// `Config` when the camera is not valid, larger than 4096 pixels per side, or `max_fps` is not in 0..=1000.
     pub fn request_viewpoint(&self, camera: &Camera, max_fps: f64) -> Result<(), TransportError> {
         check_camera("our viewpoint", camera, max_fps)?;
         self.renewal.want(Some((camera.clone(), max_fps)));
         Ok(())
     }
 
-    /// Gives our viewpoint back.
+    /// Releases the viewpoint.
     pub fn release_viewpoint(&self) {
         self.renewal.want(None);
     }
 
-    /// How our viewpoint stands.
+    /// Returns the status of the requested viewpoint.
     #[must_use]
     pub fn viewpoint_status(&self) -> ViewpointStatus {
         self.renewal.status()
     }
 
-    /// Layers of colours that come, from the coarsest, 0..=[`flyrig_stream::LAYERS`]: fewer while motion is late or missing, none before
-    /// the first template.
+    /// Returns the number of subscribed colour layers, from the coarsest, 0..=[`flyrig_stream::LAYERS`]: fewer while motion is late or
+    /// missing, none before the first template.
     #[must_use]
     pub fn color_layers(&self) -> usize {
         self.inbox.color_layers()
     }
 
-    /// Number of publishers of this rig and our schema version that live now.
+    /// Returns the number of live publishers of this rig with the same schema version.
     #[must_use]
     pub fn publishers(&self) -> usize {
         self.inbox.publishers()
     }
 
-    /// Returns the reason why the rig does not admit the key; None while it does, without a key, and before the first answer.
+    /// Returns why the rig rejects the key; `None` once it accepts it, without a key, and before the first answer.
     #[must_use]
     pub fn trouble(&self) -> Option<String> {
-        self.probe.as_ref().and_then(Probe::trouble)
+        self.probe.as_ref().and_then(KeyProbe::trouble)
     }
 
-    /// What came in, a topic each (`view/NAME`, `viewer/SUBSCRIBER/view`, `splats`, ...).
+    /// Returns the report of each topic (`view/NAME`, `viewer/SUBSCRIBER/view`, `splats`, ...).
     #[must_use]
     pub fn reports(&self) -> Vec<(String, TopicReport)> {
         self.inbox.reports()
     }
 
-    /// Messages and publishers that could not be read since the start.
+    /// Returns the number of messages and publishers that could not be read since the start.
     #[must_use]
     pub fn unreadable(&self) -> u64 {
         self.inbox.unreadable()
     }
 
-    /// Gives the viewpoint back and ends the session; dropping does the same but says nothing.
+    /// Releases the viewpoint and ends the session; dropping does the same without reporting errors.
     ///
     /// # Errors
     /// `Session` when zenoh fails to close.

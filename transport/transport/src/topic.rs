@@ -1,48 +1,56 @@
-//! A topic of the publisher: one slot that the newest message wins, and its counts.
+//! Topic of the publisher: one slot that the newest message wins, and its counts.
 
 use std::sync::{
     Arc, Mutex,
     atomic::{AtomicBool, Ordering},
 };
 
+use flyrig_stream::SplatState;
 use flyrig_types::Frame;
 use prost::bytes::Bytes;
 use zenoh::{bytes::Encoding, qos::Priority};
 
-use crate::{FrameHeader, Header, MessageKind, SplatState, TransportError, ViewFrame, header};
 pub(crate) use flyrig_types::lock;
 
-/// What became of a message that was handed in.
+use crate::{
+    cameras::frame::FrameHeader,
+    error::TransportError,
+    header::{Header, MessageKind},
+    host,
+    views::view::ViewFrame,
+};
+
+/// Outcome of handing a message in.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum PublishOutcome {
-    /// It waits for the publisher thread.
+    /// The message waits for the publisher thread.
     Queued,
-    /// The same, and an older one that still waited is dropped.
+    /// The message waits, and replaces an older one that was still waiting.
     Replaced,
-    /// Nobody subscribes: dropped at once, nothing encoded.
+    /// There is no subscriber: the message is dropped without being encoded.
     Unwatched,
 }
 
-/// Counts of one topic since the start.
+/// Message counts of one topic since the start.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]
 pub struct TopicCounts {
-    /// Handed in.
+    /// Messages handed in.
     pub offered: u64,
-    /// Handed to zenoh (which drops in silence what a subscriber is too slow for).
+    /// Messages handed to zenoh, which silently drops those that a subscriber is too slow for.
     pub sent: u64,
-    /// Dropped because a newer one came first.
+    /// Messages replaced by a newer one before they were sent.
     pub replaced: u64,
-    /// Dropped because nobody subscribes.
+    /// Messages dropped for lack of subscribers.
     pub unwatched: u64,
-    /// Could not be encoded or sent; the log says why.
+    /// Messages that could not be encoded or sent; the log has the errors.
     pub failed: u64,
     /// Payload bytes handed to zenoh.
     pub bytes: u64,
-    /// Whether somebody subscribes now.
+    /// Whether there is a subscriber now.
     pub watched: bool,
 }
 
-/// A payload before it is encoded; encoding is the publisher thread's work.
+/// Payload before the publisher thread encodes it.
 #[derive(Debug, Clone)]
 pub(crate) enum Body {
     View(ViewFrame),
@@ -51,12 +59,14 @@ pub(crate) enum Body {
     Bytes(Bytes),
 }
 
+/// Message in a slot.
 #[derive(Debug)]
 pub(crate) struct Pending {
     pub body: Body,
-    /// Its `publisher` is filled in when it is sent, and its `host` unless it is another one's.
+    /// Header, without `publisher`, and without `host` unless the message is passed on from another host: both are filled in when
+    /// it is sent.
     pub header: Header,
-    /// Messages of the topic before this one that did not leave.
+    /// Number of earlier messages of the topic that were not sent.
     pub withheld: u64,
 }
 
@@ -67,11 +77,12 @@ struct State {
     counts: TopicCounts,
 }
 
+/// Topic with its slot.
 #[derive(Debug)]
 pub(crate) struct Topic {
-    /// Last parts of the key, such as `view/front`.
+    /// Label of the key, such as `view/front`.
     pub label: String,
-    /// Name of a view, else the label.
+    /// Name of the view, otherwise the label.
     pub name: String,
     pub kind: MessageKind,
     watched: AtomicBool,
@@ -91,13 +102,13 @@ impl Topic {
         self.watched.store(watched, Ordering::Relaxed);
     }
 
-    /// Hands a message in; never waits for more than the copy of a few words.
+    /// Hands a message in; waits for no more than the copy of a few words.
     pub(crate) fn offer(&self, body: Body, mut header: Header) -> PublishOutcome {
         let mut state = lock(&self.state);
         header.kind = self.kind;
         header.sequence = state.sequence;
         if header.host == 0 {
-            header.publish_unix_nanos = header::unix_nanos();
+            header.publish_unix_nanos = host::unix_nanos();
         }
         state.sequence += 1;
         state.counts.offered += 1;
@@ -131,11 +142,11 @@ impl Topic {
         TopicCounts { watched: self.is_watched(), ..lock(&self.state).counts }
     }
 
-    /// Small messages travel in a queue of their own, so that images never hold them up.
+    /// Returns the zenoh priority: small messages have a queue of their own, so that images never delay them.
     pub(crate) fn priority(&self) -> Priority {
         match self.kind {
             MessageKind::Motion => Priority::InteractiveHigh,
-            // The coarse layer makes a person, the finest is missed least.
+            // The coarse layer shows the person, the finest matters least.
             MessageKind::Colors if self.label.ends_with("color-0") => Priority::DataHigh,
             MessageKind::Colors if self.label.ends_with("color-1") => Priority::Data,
             MessageKind::Colors => Priority::DataLow,
@@ -162,7 +173,7 @@ impl Topic {
 }
 
 impl Pending {
-    /// What travels beside the payload.
+    /// Encodes the attachment of the message.
     pub(crate) fn attachment(&self, header: Header) -> Vec<u8> {
         match &self.body {
             Body::Frame(frame) => {
@@ -178,7 +189,7 @@ impl Body {
     pub(crate) fn encode(&self, name: &str) -> Result<Vec<u8>, TransportError> {
         match self {
             Self::View(frame) => frame.encode(name),
-            Self::Splats(state) => state.encode(),
+            Self::Splats(state) => Ok(state.encode()?),
             Self::Frame(frame) => Ok(frame.image.bytes().to_vec()),
             Self::Bytes(bytes) => Ok(bytes.to_vec()),
         }

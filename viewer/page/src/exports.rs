@@ -1,9 +1,9 @@
-//! The interface that JavaScript calls. There is one page in a module; memory is handed over by address in the module's own memory.
+//! Interface for JavaScript. A module holds one page; lists are handed over by address in the module's own memory.
 #![allow(unsafe_code, reason = "exported names are unsafe attributes; there is no unsafe block")]
 
 use std::cell::RefCell;
 
-use crate::{MAX_MESSAGE_BYTES, MessageKind, Page};
+use crate::page::{MAX_MESSAGE_BYTES, Page, PageMessageKind};
 
 #[derive(Default)]
 struct State {
@@ -34,13 +34,13 @@ pub extern "C" fn input(length: usize) -> *mut u8 {
     })
 }
 
-/// Takes the message in that lies in the input. Returns 0, or 1 for one that was refused ([`error`] says why).
+/// Ingests the message in the input. Returns 0, or 1 for one that was refused ([`error`] has the reason).
 #[unsafe(no_mangle)]
 pub extern "C" fn take(kind: u32, person: u32, now: f64) -> u32 {
     with(|state| {
         let input = std::mem::take(&mut state.input);
-        let taken = match MessageKind::of(kind) {
-            Some(kind) => state.page.take(kind, person, &input, now).map_err(|error| error.to_string()),
+        let taken = match PageMessageKind::of(kind) {
+            Some(kind) => state.page.ingest(kind, person, &input, now).map_err(|error| error.to_string()),
             None => Err(format!("message of unknown kind {kind}; load the page again")),
         };
         state.input = input;
@@ -49,25 +49,25 @@ pub extern "C" fn take(kind: u32, person: u32, now: f64) -> u32 {
     })
 }
 
-/// Address of the last message's error, UTF-8.
+/// Returns the address of the last message's error, UTF-8.
 #[unsafe(no_mangle)]
 pub extern "C" fn error() -> *const u8 {
     with(|state| state.error.as_ptr())
 }
 
-/// Bytes of the last message's error.
+/// Returns the length of the last message's error, bytes.
 #[unsafe(no_mangle)]
 pub extern "C" fn error_length() -> usize {
     with(|state| state.error.len())
 }
 
-/// [`Page::forget_people`].
+/// Calls [`Page::forget_people`].
 #[unsafe(no_mangle)]
 pub extern "C" fn forget_people() {
     with(|state| state.page.forget_people());
 }
 
-/// [`Page::pose`]; returns the number of Gaussians.
+/// Calls [`Page::pose`]; returns the number of Gaussians.
 #[unsafe(no_mangle)]
 pub extern "C" fn pose(now: f64, interpolate: u32) -> usize {
     with(|state| {
@@ -76,37 +76,37 @@ pub extern "C" fn pose(now: f64, interpolate: u32) -> usize {
     })
 }
 
-/// Whether the last [`pose`] changed centres (1) and colours (2).
+/// Returns whether the last [`pose`] changed centres (1) and colours (2), added up.
 #[unsafe(no_mangle)]
 pub extern "C" fn changes() -> u32 {
     with(|state| u32::from(state.moved) | u32::from(state.recolored) << 1)
 }
 
-/// Address of the centres and standard deviations, four floats a Gaussian.
+/// Returns the address of the centres and standard deviations, four floats per Gaussian.
 #[unsafe(no_mangle)]
 pub extern "C" fn centers() -> *const [f32; 4] {
     with(|state| state.page.centers().as_ptr())
 }
 
-/// Address of the normals, four floats a Gaussian.
+/// Returns the address of the normals, four floats per Gaussian.
 #[unsafe(no_mangle)]
 pub extern "C" fn normals() -> *const [f32; 4] {
     with(|state| state.page.normals().as_ptr())
 }
 
-/// Address of the linear RGB and opacities, four floats a Gaussian.
+/// Returns the address of linear RGB and opacities, four floats per Gaussian.
 #[unsafe(no_mangle)]
 pub extern "C" fn colors() -> *const [f32; 4] {
     with(|state| state.page.colors().as_ptr())
 }
 
-/// Address of [`Page::scales`] as of the last [`look`] or [`order`], four floats a Gaussian; 0 while nobody is an avatar.
+/// Returns the address of [`Page::scales`] as of the last [`look`] or [`order`], four floats per Gaussian; 0 without an avatar.
 #[unsafe(no_mangle)]
 pub extern "C" fn scales() -> *const [f32; 4] {
     with(|state| address_of(state.page.scales()))
 }
 
-/// Address of [`Page::rotations`], four floats a Gaussian; 0 while nobody is an avatar.
+/// Returns the address of [`Page::rotations`], four floats per Gaussian; 0 without an avatar.
 #[unsafe(no_mangle)]
 pub extern "C" fn rotations() -> *const [f32; 4] {
     with(|state| address_of(state.page.rotations()))
@@ -116,7 +116,7 @@ fn address_of(rows: &[[f32; 4]]) -> *const [f32; 4] {
     if rows.is_empty() { std::ptr::null() } else { rows.as_ptr() }
 }
 
-/// [`Page::order`]; returns its address. [`order_length`] is valid afterwards.
+/// Calls [`Page::order`] and returns the address of the result, whose length is [`order_length`].
 #[unsafe(no_mangle)]
 pub extern "C" fn order(width: u32, height: u32) -> *const u32 {
     with(|state| {
@@ -130,19 +130,19 @@ thread_local! {
     static ORDERED: std::cell::Cell<usize> = const { std::cell::Cell::new(0) };
 }
 
-/// Number of Gaussians of the last [`order`].
+/// Returns the number of Gaussians of the last [`order`].
 #[unsafe(no_mangle)]
 pub extern "C" fn order_length() -> usize {
     ORDERED.get()
 }
 
-/// [`Page::look`]; returns 1 once the rig is known.
+/// Calls [`Page::look`]; returns 1 once the rig is known.
 #[unsafe(no_mangle)]
 pub extern "C" fn look(width: u32, height: u32) -> u32 {
     with(|state| state.page.look(width, height).is_some().into())
 }
 
-/// Address of the camera of the last [`look`] or [`order`], [`crate::CAMERA_FLOATS`] floats.
+/// Returns the address of the camera of the last [`look`] or [`order`], [`crate::page::CAMERA_FLOATS`] floats.
 #[unsafe(no_mangle)]
 pub extern "C" fn camera() -> *const f32 {
     with(|state| state.page.camera().as_ptr())
@@ -154,13 +154,13 @@ pub extern "C" fn orbit(right: f64, down: f64) {
     with(|state| state.page.navigation().map(|view| view.orbit(right, down)));
 }
 
-/// Shifts the view by shares of its height.
+/// Shifts the view by fractions of its height.
 #[unsafe(no_mangle)]
 pub extern "C" fn shift(right: f64, down: f64) {
     with(|state| state.page.navigation().map(|view| view.shift(right, down)));
 }
 
-/// Comes nearer by a factor.
+/// Divides the distance to the target by a factor.
 #[unsafe(no_mangle)]
 pub extern "C" fn zoom(factor: f64) {
     with(|state| state.page.navigation().map(|view| view.zoom(factor)));
@@ -172,25 +172,25 @@ pub extern "C" fn fly(right: f64, up: f64, forward: f64) {
     with(|state| state.page.navigation().map(|view| view.fly(right, up, forward)));
 }
 
-/// [`Page::set_follows`].
+/// Calls [`Page::set_follows`].
 #[unsafe(no_mangle)]
 pub extern "C" fn follow(follows: u32) {
     with(|state| state.page.set_follows(follows != 0));
 }
 
-/// [`Page::jump`].
+/// Calls [`Page::jump`].
 #[unsafe(no_mangle)]
 pub extern "C" fn jump(camera: usize) {
     with(|state| state.page.jump(camera));
 }
 
-/// People who are shown, and whether everybody has all colours (bit 8).
+/// Returns the number of people shown, and in bit 8 whether all of them have all of their colours.
 #[unsafe(no_mangle)]
 pub extern "C" fn people() -> u32 {
     with(|state| state.page.people_shown() as u32 | u32::from(state.page.is_complete()) << 8)
 }
 
-/// [`Page::frame`].
+/// Returns [`Page::frame`].
 #[unsafe(no_mangle)]
 pub extern "C" fn frame() -> f64 {
     with(|state| state.page.frame() as f64)

@@ -1,15 +1,15 @@
-//! The order in which Gaussians are drawn.
+//! Drawing order of Gaussians.
 
 use flyrig_types::Camera;
 use flyrig_viewing::{BACKFACING_COSINE, faces_away};
 use glam::{DVec3, Vec3, Vec4};
 
-/// Gaussians whose centre is closer to the camera's plane are not drawn, metres; as on the rig.
+/// Least depth of a Gaussian's centre that is drawn, metres; as on the rig.
 const NEAR_M: f32 = 0.05;
-/// Steps of depth; equal ones keep the order of the Gaussians.
+/// Steps of depth; Gaussians within one keep their order.
 const STEPS: usize = 1 << 16;
 
-/// Indices of the Gaussians that a camera sees, farthest first. Memory is kept from one image to the next.
+/// Indices of the Gaussians that a camera sees, farthest first; memory is kept from one image to the next.
 #[derive(Debug, Default)]
 pub struct DrawOrder {
     seen: Vec<(u32, f32)>,
@@ -18,7 +18,7 @@ pub struct DrawOrder {
 }
 
 impl DrawOrder {
-    /// Sorts isotropic Gaussians as [`Self::sort_shown`] does; those that face away or have a normal that is not finite are left out.
+    /// Sorts isotropic Gaussians as [`Self::sort_shown`]; those that face away or have a non-finite normal are left out.
     pub fn sort(&mut self, camera: &Camera, center_scale: &[[f32; 4]], normals: &[[f32; 4]]) -> &[u32] {
         let count = center_scale.len().min(normals.len());
         self.sort_shown(camera, &center_scale[..count], |index, sight| {
@@ -27,8 +27,8 @@ impl DrawOrder {
         })
     }
 
-    /// Sorts by depth, to 1/65536 of the depth of the whole scene, the Gaussians that `is_shown` keeps by their index and the line of
-    /// sight to their centre. Those that lie behind the camera or hold numbers that are not finite are left out.
+    /// Sorts by depth, to 1/65536 of the depth range of the scene, the Gaussians that `is_shown` accepts by their index and the line of sight
+    /// to their centre. Gaussians behind the camera or with non-finite numbers are left out.
     pub fn sort_shown(
         &mut self,
         camera: &Camera,

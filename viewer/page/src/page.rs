@@ -4,30 +4,30 @@ use std::{fmt, sync::Arc};
 
 use flyrig_stream::{Posed, PosedAxes, StreamError, StreamTemplate};
 use flyrig_types::{Camera, Rig};
-use flyrig_viewing::{Ellipsoids, Navigation, People, Taken};
+use flyrig_viewing::{Ellipsoids, Ingested, Navigation, People};
 use glam::DVec3;
 
-use crate::DrawOrder;
+use crate::order::DrawOrder;
 
-/// Longest message that is taken, bytes: a template has less.
+/// Longest message, bytes; templates are shorter.
 pub const MAX_MESSAGE_BYTES: usize = 16 << 20;
-/// Numbers of a camera: `camera_from_world` by columns, then focal length and principal point, pixels.
+/// Number of floats of a camera: `camera_from_world` by columns, then focal length and principal point, pixels.
 pub const CAMERA_FLOATS: usize = 19;
 
-/// Kind of a message; the number is its first byte.
+/// Kind of a message of the page, by its first byte.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub enum MessageKind {
-    /// Cameras and up of the rig, JSON.
+pub enum PageMessageKind {
+    /// Cameras and up direction of the rig, JSON.
     Rig,
-    /// A person's template.
+    /// Template of a person.
     Template,
-    /// A person's motion.
+    /// Motion of a person.
     Motion,
-    /// A layer of a person's colours.
+    /// Layer of a person's colours.
     Colors,
 }
 
-impl MessageKind {
+impl PageMessageKind {
     /// Returns the kind of a number.
     #[must_use]
     pub fn of(number: u32) -> Option<Self> {
@@ -35,12 +35,12 @@ impl MessageKind {
     }
 }
 
-/// Why a message was refused.
+/// Error of a message that was refused.
 #[derive(Debug, PartialEq)]
 pub enum PageError {
     /// Damaged bytes.
     Stream(StreamError),
-    /// A rig that is no rig.
+    /// Invalid calibration of the rig.
     Rig(String),
 }
 
@@ -53,7 +53,7 @@ impl fmt::Display for PageError {
     }
 }
 
-/// People, viewpoint, and the Gaussians as they are shown now.
+/// State of the page: people, viewpoint, and the Gaussians as shown now.
 #[derive(Debug, Default)]
 pub struct Page {
     people: People,
@@ -63,43 +63,43 @@ pub struct Page {
     centers: Vec<[f32; 4]>,
     normals: Vec<[f32; 4]>,
     colors: Vec<[f32; 4]>,
-    /// Number, hash of the motion and count of colour messages of each person in the lists below.
+    /// Number, hash of the motion and count of colour messages of each person shown.
     shown: Vec<(u32, u64, u64)>,
-    /// Whether somebody has a new template, or is forgotten.
+    /// Whether a person has a new template, or was forgotten.
     is_stale: bool,
-    /// The rig's frame number of the first person's motion.
+    /// Frame number of the first person's motion on the rig.
     frame: u64,
     posed: Posed,
     axes: PosedAxes,
-    /// Shapes of the Gaussians; empty while nobody is an avatar.
+    /// Shapes of the Gaussians; empty without an avatar.
     ellipsoids: Ellipsoids,
     order: DrawOrder,
     camera: [f32; CAMERA_FLOATS],
 }
 
 impl Page {
-    /// Takes in a message that came at `now`. Messages of a person whose template is missing wait for it.
+    /// Ingests a message that arrived at `now`. Messages of a person whose template is missing wait for it.
     ///
     /// # Errors
-    /// [`PageError`] for damaged bytes; what was there before stays.
-    pub fn take(&mut self, kind: MessageKind, person: u32, bytes: &[u8], now: f64) -> Result<(), PageError> {
+    /// [`PageError`] for damaged bytes; the state is then unchanged.
+    pub fn ingest(&mut self, kind: PageMessageKind, person: u32, bytes: &[u8], now: f64) -> Result<(), PageError> {
         match kind {
-            MessageKind::Rig => return self.take_rig(bytes),
-            MessageKind::Template => {
+            PageMessageKind::Rig => return self.ingest_rig(bytes),
+            PageMessageKind::Template => {
                 let template = StreamTemplate::decode(bytes).map_err(PageError::Stream)?;
-                self.people.meet(person, Arc::new(template));
+                self.people.set_template(person, Arc::new(template));
                 self.is_stale = true;
             }
-            MessageKind::Motion | MessageKind::Colors => {
-                let is_motion = kind == MessageKind::Motion;
-                let taken: Result<Taken, StreamError> = self.people.take(person, is_motion, bytes, now);
-                taken.map_err(PageError::Stream)?;
+            PageMessageKind::Motion | PageMessageKind::Colors => {
+                let is_motion = kind == PageMessageKind::Motion;
+                let ingested: Result<Ingested, StreamError> = self.people.ingest(person, is_motion, bytes, now);
+                ingested.map_err(PageError::Stream)?;
             }
         }
         Ok(())
     }
 
-    fn take_rig(&mut self, bytes: &[u8]) -> Result<(), PageError> {
+    fn ingest_rig(&mut self, bytes: &[u8]) -> Result<(), PageError> {
         let rig: Rig = serde_json::from_slice(bytes).map_err(|error| PageError::Rig(error.to_string()))?;
         rig.validate().map_err(|error| PageError::Rig(error.to_string()))?;
         if self.rig.as_ref() != Some(&rig) {
@@ -109,13 +109,13 @@ impl Page {
         Ok(())
     }
 
-    /// Forgets people, for a rig that begins anew; the viewpoint stays.
+    /// Forgets all people, for a rig that restarted; the viewpoint stays.
     pub fn forget_people(&mut self) {
         self.people.clear();
         self.is_stale = true;
     }
 
-    /// Poses everybody as they are shown at `now`. Returns whether centres, and whether colours, differ from those before.
+    /// Poses all people as shown at `now`. Returns whether centres, and whether colours, have changed.
     pub fn pose(&mut self, now: f64, interpolate: bool) -> (bool, bool) {
         let numbers: Vec<u32> = self.people.iter().map(|(number, _)| number).collect();
         let mut motions = Vec::new();
@@ -152,7 +152,7 @@ impl Page {
         for ((number, ..), motion) in &motions {
             let Some(person) = self.people.get_mut(*number) else { continue };
             let colors = person.pose(motion, &mut self.posed);
-            // An avatar's light shows its colours differently in each pose.
+            // The light changes an avatar's colours in each pose.
             recolored |= moved && person.template().is_avatar();
             let count = self.posed.center_scale.len().min(colors.len());
             self.centers.extend_from_slice(&self.posed.center_scale[..count]);
@@ -168,7 +168,7 @@ impl Page {
         (moved, recolored)
     }
 
-    /// Returns the indices of the Gaussians to draw into an image of this size, farthest first; nothing before the rig is known.
+    /// Returns the indices of the Gaussians to draw into an image of this size, farthest first; empty before the rig is known.
     pub fn order(&mut self, width: u32, height: u32) -> &[u32] {
         let Some(camera) = self.look(width, height) else { return &[] };
         if self.ellipsoids.is_empty() {
@@ -178,8 +178,8 @@ impl Page {
         self.order.sort_shown(&camera, &self.centers, |index, _| seen.get(index).is_some_and(|shape| shape[3] > 0.0))
     }
 
-    /// Returns the camera for an image of this size and keeps its numbers ([`Self::camera`]) and the shapes that it sees
-    /// ([`Self::scales`]); nothing before the rig is known.
+    /// Returns the camera for an image of this size, and keeps its numbers ([`Self::camera`]) and the shapes that it sees
+    /// ([`Self::scales`]); `None` before the rig is known.
     pub fn look(&mut self, width: u32, height: u32) -> Option<Camera> {
         let navigation = self.navigation.as_ref()?;
         let camera = navigation.camera(width.clamp(1, 16_384), height.clamp(1, 16_384));
@@ -197,44 +197,45 @@ impl Page {
         Some(camera)
     }
 
-    /// Camera of the last [`Self::look`] or [`Self::order`].
+    /// Returns the camera of the last [`Self::look`] or [`Self::order`].
     #[must_use]
     pub fn camera(&self) -> &[f32; CAMERA_FLOATS] {
         &self.camera
     }
 
-    /// Centre and standard deviation of each Gaussian, metres, world.
+    /// Returns centre and standard deviation of each Gaussian, metres, world.
     #[must_use]
     pub fn centers(&self) -> &[[f32; 4]] {
         &self.centers
     }
 
-    /// Unit normal of each Gaussian's surface, world; the fourth number is its depth below the surface, metres.
+    /// Returns the unit normal of each Gaussian's surface, world; w: depth below the surface, metres.
     #[must_use]
     pub fn normals(&self) -> &[[f32; 4]] {
         &self.normals
     }
 
-    /// Linear RGB and opacity of each Gaussian.
+    /// Returns linear RGB and opacity of each Gaussian.
     #[must_use]
     pub fn colors(&self) -> &[[f32; 4]] {
         &self.colors
     }
 
-    /// Standard deviations along the axes of each Gaussian, metres, and its opacity, 0 for one that faces away from the camera of the last
-    /// [`Self::look`] or [`Self::order`]; empty while nobody is an avatar.
+    /// Returns the standard deviations along the axes of each Gaussian, metres, and its opacity, 0 for one that faces away from the camera
+    /// of the last [`Self::look`] or [`Self::order`]; empty without an avatar.
     #[must_use]
     pub fn scales(&self) -> &[[f32; 4]] {
         self.ellipsoids.seen()
     }
 
-    /// Unit quaternion x, y, z, w of each Gaussian, world from its axes; empty while nobody is an avatar, and all Gaussians are isotropic.
+    /// Returns the unit quaternion x, y, z, w of each Gaussian, world from its axes; empty without an avatar, when all Gaussians are
+    /// isotropic.
     #[must_use]
     pub fn rotations(&self) -> &[[f32; 4]] {
         self.ellipsoids.rotations()
     }
 
-    /// The viewpoint, once the rig is known.
+    /// Returns the viewpoint, once the rig is known.
     pub fn navigation(&mut self) -> Option<&mut Navigation> {
         self.navigation.as_mut()
     }
@@ -247,7 +248,7 @@ impl Page {
         }
     }
 
-    /// Stands where a camera of the rig stands; a number beyond them changes nothing.
+    /// Moves the viewpoint to a camera of the rig; a number beyond the cameras changes nothing.
     pub fn jump(&mut self, camera: usize) {
         let camera = self.rig.as_ref().and_then(|rig| rig.cameras.get(camera));
         if let (Some(camera), Some(navigation)) = (camera, &mut self.navigation) {
@@ -255,26 +256,26 @@ impl Page {
         }
     }
 
-    /// Number of people who are shown.
+    /// Returns the number of people shown.
     #[must_use]
     pub fn people_shown(&self) -> usize {
         self.shown.len()
     }
 
-    /// The rig's frame number of the first person who is shown.
+    /// Returns the rig's frame number of the first person shown.
     #[must_use]
     pub fn frame(&self) -> u64 {
         self.frame
     }
 
-    /// Whether everybody who is known has all colours; false without anybody.
+    /// Returns whether all known people have all of their colours; false without people.
     #[must_use]
     pub fn is_complete(&self) -> bool {
         !self.people.is_empty() && self.people.iter().all(|(_, person)| person.is_complete())
     }
 }
 
-/// A number that differs where motions differ.
+/// Returns a number that differs where motions differ.
 fn motion_key(motion: &flyrig_stream::Motion) -> u64 {
     // Interpolated motions of one pair share the stamp; the root and one rotation separate them.
     let numbers = motion

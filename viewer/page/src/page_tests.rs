@@ -12,7 +12,7 @@ fn template(size: f32) -> EncodedTemplate {
     encode(size, [-1.0, -1.0], |source| source.encode())
 }
 
-/// Of needles that lie in all directions; every other one faces away from the cameras.
+/// Creates an avatar of needles in all directions, every other of which faces away from the cameras.
 fn avatar() -> EncodedTemplate {
     let gaussians: Vec<AvatarGaussian> = (0..GAUSSIANS)
         .map(|i| AvatarGaussian {
@@ -62,7 +62,7 @@ fn rig() -> Rig {
 
 fn page() -> Page {
     let mut page = Page::default();
-    page.take(MessageKind::Rig, 0, &serde_json::to_vec(&rig()).unwrap(), 0.0).unwrap();
+    page.ingest(PageMessageKind::Rig, 0, &serde_json::to_vec(&rig()).unwrap(), 0.0).unwrap();
     page
 }
 
@@ -71,27 +71,27 @@ fn a_person_is_shown_once_template_motion_and_rig_are_there() {
     let encoded = template(1.0);
     let mut page = Page::default();
     assert!(page.order(640, 480).is_empty() && page.people_shown() == 0 && !page.is_complete());
-    page.take(MessageKind::Motion, 2, &motion(&encoded, 1, 0.5), 0.0).unwrap();
+    page.ingest(PageMessageKind::Motion, 2, &motion(&encoded, 1, 0.5), 0.0).unwrap();
     assert_eq!(page.pose(0.0, false), (false, false));
-    page.take(MessageKind::Template, 2, &encoded.bytes, 0.0).unwrap();
+    page.ingest(PageMessageKind::Template, 2, &encoded.bytes, 0.0).unwrap();
     assert_eq!(page.pose(0.0, false), (true, true), "a motion that came early is applied");
     assert!((page.centers()[0][0] - 0.5).abs() < 1e-3 && page.centers().len() == GAUSSIANS);
     assert!(page.order(640, 480).is_empty(), "without a rig there is no viewpoint");
-    page.take(MessageKind::Rig, 0, &serde_json::to_vec(&rig()).unwrap(), 0.0).unwrap();
+    page.ingest(PageMessageKind::Rig, 0, &serde_json::to_vec(&rig()).unwrap(), 0.0).unwrap();
     assert_eq!(page.order(640, 480).len(), GAUSSIANS);
 
     let mut colors = ColorEncoder::new(&encoded, ColorSettings::default(), 7);
     for layer in &colors.encode(Stamp::default(), &[[0.5, 0.2, 0.1, 1.0]; GAUSSIANS]) {
-        page.take(MessageKind::Colors, 2, layer, 0.0).unwrap();
+        page.ingest(PageMessageKind::Colors, 2, layer, 0.0).unwrap();
     }
     assert_eq!(page.pose(0.0, false), (false, true));
     assert!(page.is_complete() && (page.colors()[5][0] - 0.5).abs() < 0.05);
     assert_eq!(page.pose(0.0, false), (false, false), "nothing is done twice");
-    page.take(MessageKind::Motion, 2, &motion(&encoded, 2, 0.6), 0.1).unwrap();
+    page.ingest(PageMessageKind::Motion, 2, &motion(&encoded, 2, 0.6), 0.1).unwrap();
     assert_eq!((page.pose(0.1, false), page.frame()), ((true, false), 2));
-    // Whoever is gone is not drawn.
+    // A person that is gone is not drawn.
     assert_eq!((page.pose(60.0, false), page.people_shown()), ((true, true), 0));
-    page.take(MessageKind::Motion, 2, &motion(&encoded, 3, 0.6), 60.1).unwrap();
+    page.ingest(PageMessageKind::Motion, 2, &motion(&encoded, 3, 0.6), 60.1).unwrap();
     assert!(page.pose(60.1, false).0 && !page.centers().is_empty());
     page.forget_people();
     assert_eq!(page.pose(60.1, false), (true, true));
@@ -122,10 +122,10 @@ fn the_camera_is_that_of_the_window() {
 #[test]
 fn following_moves_the_viewpoint_with_the_person() {
     let (mut page, encoded) = (page(), template(1.0));
-    page.take(MessageKind::Template, 0, &encoded.bytes, 0.0).unwrap();
+    page.ingest(PageMessageKind::Template, 0, &encoded.bytes, 0.0).unwrap();
     page.set_follows(true);
     let place = |page: &mut Page, frame: u64, x: f32| {
-        page.take(MessageKind::Motion, 0, &motion(&encoded, frame, x), 0.1 * frame as f64).unwrap();
+        page.ingest(PageMessageKind::Motion, 0, &motion(&encoded, frame, x), 0.1 * frame as f64).unwrap();
         page.pose(0.1 * frame as f64, false);
         page.order(64, 64);
         let camera = *page.camera();
@@ -142,16 +142,16 @@ fn following_moves_the_viewpoint_with_the_person() {
 #[test]
 fn damaged_messages_are_refused_and_change_nothing() {
     let (mut page, encoded) = (page(), template(1.0));
-    page.take(MessageKind::Template, 0, &encoded.bytes, 0.0).unwrap();
+    page.ingest(PageMessageKind::Template, 0, &encoded.bytes, 0.0).unwrap();
     let good = motion(&encoded, 1, 0.2);
-    page.take(MessageKind::Motion, 0, &good, 0.0).unwrap();
+    page.ingest(PageMessageKind::Motion, 0, &good, 0.0).unwrap();
     page.pose(0.0, false);
     let before = page.centers().to_vec();
     let mut state = 1u32;
-    for kind in [MessageKind::Rig, MessageKind::Template, MessageKind::Motion, MessageKind::Colors] {
-        page.take(kind, 0, &[], 0.0).unwrap_err();
-        page.take(kind, 0, b"\xff\x00noise", 0.0).unwrap_err();
-        let original = if kind == MessageKind::Template { encoded.bytes.clone() } else { good.clone() };
+    for kind in [PageMessageKind::Rig, PageMessageKind::Template, PageMessageKind::Motion, PageMessageKind::Colors] {
+        page.ingest(kind, 0, &[], 0.0).unwrap_err();
+        page.ingest(kind, 0, b"\xff\x00noise", 0.0).unwrap_err();
+        let original = if kind == PageMessageKind::Template { encoded.bytes.clone() } else { good.clone() };
         for _ in 0..2000 {
             let mut bytes = original.clone();
             state = state.wrapping_mul(1_664_525).wrapping_add(1_013_904_223);
@@ -159,23 +159,23 @@ fn damaged_messages_are_refused_and_change_nothing() {
             bytes[at] ^= 1 << (state >> 29);
             bytes.truncate(bytes.len() - (state >> 8) as usize % 3);
             // Damage that is not noticed changes numbers, never the program.
-            drop(page.take(kind, 7, &bytes, 0.0));
+            drop(page.ingest(kind, 7, &bytes, 0.0));
         }
     }
     page.pose(0.0, false);
     assert_eq!(page.centers()[..GAUSSIANS], before[..]);
     let rig = String::from_utf8(serde_json::to_vec(&rig()).unwrap()).unwrap().replace("500.0", "-1.0");
-    let error = page.take(MessageKind::Rig, 0, rig.as_bytes(), 0.0).unwrap_err().to_string();
+    let error = page.ingest(PageMessageKind::Rig, 0, rig.as_bytes(), 0.0).unwrap_err().to_string();
     assert!(error.starts_with("the rig's calibration is damaged"), "{error}");
-    assert_eq!(MessageKind::of(4), None);
+    assert_eq!(PageMessageKind::of(4), None);
 }
 
 #[test]
 fn an_avatar_has_the_axes_of_its_template_and_hides_what_faces_away() {
     let (mut page, encoded, plain) = (page(), avatar(), template(1.0));
-    page.take(MessageKind::Template, 0, &encoded.bytes, 0.0).unwrap();
+    page.ingest(PageMessageKind::Template, 0, &encoded.bytes, 0.0).unwrap();
     let bytes = motion(&encoded, 1, 0.5);
-    page.take(MessageKind::Motion, 0, &bytes, 0.0).unwrap();
+    page.ingest(PageMessageKind::Motion, 0, &bytes, 0.0).unwrap();
     assert_eq!(page.pose(0.0, false), (true, true));
     assert!(page.is_complete());
     let received = Motion::decode(&bytes, &encoded.template).unwrap();
@@ -193,18 +193,18 @@ fn an_avatar_has_the_axes_of_its_template_and_hides_what_faces_away() {
         assert_eq!(scales.map(f32::to_bits), expected.map(f32::to_bits), "{i}");
     }
 
-    // From behind, the others; beside somebody who is no avatar, both.
+    // From behind, the other half; beside a person that is no avatar, both kinds.
     let from_behind = page.navigation().map(|view| view.orbit(std::f64::consts::PI, 0.0)).and(page.look(640, 480));
     assert!(from_behind.unwrap().position().y > 1.0);
     let mut order = page.order(640, 480).to_vec();
     order.sort_unstable();
     assert!(order.len() == GAUSSIANS / 2 && order.iter().all(|i| !toward.contains(i)), "{order:?}");
-    page.take(MessageKind::Template, 1, &plain.bytes, 0.0).unwrap();
-    page.take(MessageKind::Motion, 1, &motion(&plain, 1, 0.5), 0.0).unwrap();
-    page.take(MessageKind::Motion, 0, &motion(&encoded, 2, 0.5), 0.1).unwrap();
+    page.ingest(PageMessageKind::Template, 1, &plain.bytes, 0.0).unwrap();
+    page.ingest(PageMessageKind::Motion, 1, &motion(&plain, 1, 0.5), 0.0).unwrap();
+    page.ingest(PageMessageKind::Motion, 0, &motion(&encoded, 2, 0.5), 0.1).unwrap();
     let mut colors = ColorEncoder::new(&plain, ColorSettings::default(), 7);
     for layer in &colors.encode(Stamp::default(), &[[0.5, 0.2, 0.1, 1.0]; GAUSSIANS]) {
-        page.take(MessageKind::Colors, 1, layer, 0.0).unwrap();
+        page.ingest(PageMessageKind::Colors, 1, layer, 0.0).unwrap();
     }
     page.pose(0.1, false);
     page.look(640, 480).unwrap();
@@ -214,8 +214,8 @@ fn an_avatar_has_the_axes_of_its_template_and_hides_what_faces_away() {
 
     // Without the avatar nothing has axes.
     page.forget_people();
-    page.take(MessageKind::Template, 1, &plain.bytes, 0.2).unwrap();
-    page.take(MessageKind::Motion, 1, &motion(&plain, 2, 0.5), 0.2).unwrap();
+    page.ingest(PageMessageKind::Template, 1, &plain.bytes, 0.2).unwrap();
+    page.ingest(PageMessageKind::Motion, 1, &motion(&plain, 2, 0.5), 0.2).unwrap();
     page.pose(0.2, false);
     page.look(640, 480).unwrap();
     assert!(!page.centers().is_empty() && page.rotations().is_empty() && page.scales().is_empty());

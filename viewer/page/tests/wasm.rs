@@ -1,7 +1,7 @@
 //! The page's WebAssembly as it is shipped does what this crate does.
 #![allow(clippy::unwrap_used)] // a test may fail by panicking, in its helpers too
 
-use flyrig_page::{CAMERA_FLOATS, MessageKind, Page};
+use flyrig_page::{CAMERA_FLOATS, Page, PageMessageKind};
 use flyrig_stream::{
     AvatarGaussian, AvatarSource, ColorEncoder, ColorSettings, LIGHT_TERMS, Motion, MotionEncoder, Stamp, StreamJoint,
     TemplateSource,
@@ -98,7 +98,7 @@ fn the_shipped_module_decodes_poses_and_sorts_as_this_crate_does() {
 
     let (mut ours, mut shipped) = (Page::default(), Shipped::new());
     let mut both = |kind: u32, bytes: &[u8], now: f64| {
-        ours.take(MessageKind::of(kind).unwrap(), 1, bytes, now).unwrap();
+        ours.ingest(PageMessageKind::of(kind).unwrap(), 1, bytes, now).unwrap();
         assert_eq!(shipped.take(kind, 1, bytes, now), 0);
     };
     both(0, &rig, 0.0);
@@ -154,7 +154,7 @@ fn the_shipped_module_decodes_poses_and_sorts_as_this_crate_does() {
     let motion = Motion { stamp, root_translation: [1.0, 0.0, 1.0], joint_rotations, nodes: Vec::new() };
     let motion = MotionEncoder::new(&avatar).encode(&motion).unwrap();
     for (kind, bytes) in [(1, &avatar.bytes), (2, &motion)] {
-        ours.take(MessageKind::of(kind).unwrap(), 2, bytes, 0.16).unwrap();
+        ours.ingest(PageMessageKind::of(kind).unwrap(), 2, bytes, 0.16).unwrap();
         assert_eq!(shipped.take(kind, 2, bytes, 0.16), 0);
     }
     ours.pose(0.16, false);

@@ -1,27 +1,28 @@
-//! People of whom one at least is an avatar, as Gaussians of three axes on the device.
+//! People, at least one of whom is an avatar, as anisotropic Gaussians on the device.
 
 use flyrig_gpu::{GpuContext, GpuError};
 use flyrig_renderer::{AnisotropicBuffers, HarmonicOrder, SH_DEGREE_0};
 use flyrig_types::Camera;
 use flyrig_viewing::Ellipsoids;
 
-use crate::scene::ShownPerson;
+use crate::shown_person::ShownPerson;
 
-/// Gaussians on the device, as one camera sees them.
+/// Anisotropic Gaussians on the device for one camera.
 #[derive(Debug)]
 pub(crate) struct EllipsoidBuffers {
     buffers: AnisotropicBuffers,
-    /// Lists of all people.
+    /// Centres of all people.
     center: Vec<[f32; 4]>,
+    /// Normals of all people.
     normal: Vec<[f32; 4]>,
     shapes: Ellipsoids,
 }
 
 impl EllipsoidBuffers {
-    /// Of these people, isotropic ones included; buffers of `before` are used again where their size fits.
+    /// Uploads people, isotropic ones included; reuses the buffers of `before` where their size fits.
     ///
     /// # Errors
-    /// [`GpuError::TooLarge`].
+    /// [`GpuError::TooLarge`] for more Gaussians than a buffer holds.
     pub fn new(gpu: &GpuContext, people: &[ShownPerson<'_>], before: Option<Self>) -> Result<Self, GpuError> {
         let (mut center, mut normal, mut harmonics) = (Vec::new(), Vec::new(), Vec::new());
         let mut shapes = Ellipsoids::default();
@@ -34,7 +35,7 @@ impl EllipsoidBuffers {
                 .extend(colors.iter().map(|[r, g, b, _]| [r / SH_DEGREE_0, g / SH_DEGREE_0, b / SH_DEGREE_0, 0.0]));
             shapes.push(centers, colors, person.axes);
         }
-        // A buffer has at least one element: zero, which is not drawn.
+        // A buffer has at least one element; zeros are not drawn.
         let buffers = match before.map(|before| before.buffers).filter(|buffers| buffers.count() == center.len()) {
             Some(buffers) => buffers,
             None => AnisotropicBuffers::zeroed(gpu, center.len().max(1), HarmonicOrder::Zero)?,
@@ -47,7 +48,7 @@ impl EllipsoidBuffers {
         Ok(Self { buffers, center, normal, shapes })
     }
 
-    /// Leaves out what faces away from a camera, and returns the Gaussians to draw.
+    /// Hides Gaussians that face away from a camera, and returns the buffers to draw.
     pub fn seen_by(&mut self, gpu: &GpuContext, camera: &Camera) -> &AnisotropicBuffers {
         let seen = self.shapes.seen_from(camera.position().as_vec3(), &self.center, &self.normal);
         if !seen.is_empty() {

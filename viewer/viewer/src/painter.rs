@@ -1,4 +1,4 @@
-//! Draws the people on a thread of its own, so that the window answers at once.
+//! Painter: draws the people on a thread of its own, so that the window responds at once.
 
 use std::{
     sync::{Arc, Condvar, Mutex, MutexGuard},
@@ -12,32 +12,39 @@ use flyrig_types::{Camera, SupervisedThread, ThreadHealth, lock, wait};
 use flyrig_viewing::StreamPerson;
 use glam::DVec3;
 
-use crate::{Receiver, Scene, ShownPerson, receiver::clock_secs};
+use crate::{
+    receiver::{Receiver, clock_secs},
+    scene::PeopleScene,
+    shown_person::ShownPerson,
+};
 
-/// Grey behind the people, sRGB.
+/// Grey of the background, sRGB.
 const BACKDROP: u8 = 30;
 
-/// A view that is wanted.
+/// View to draw.
 #[derive(Debug, Clone, PartialEq)]
 pub(crate) struct Request {
     pub camera: Camera,
     pub interpolate: bool,
 }
 
-/// A drawn view.
+/// View that was drawn.
 #[derive(Debug)]
-pub(crate) struct Drawn {
+pub(crate) struct PaintedView {
     pub width: u32,
     pub height: u32,
     pub rgb: Vec<u8>,
-    /// The rig's frame, capture time, and age when it was drawn, where this host's clock knows it.
+    /// Frame number of the rig.
     pub frame: u64,
+    /// Age of the frame when it was drawn, seconds; `None` where no clock of this host is known for it.
     pub age_secs: Option<f64>,
-    /// Root of the first person that is shown.
+    /// Root of the first person shown, world, metres.
     pub place: Option<DVec3>,
+    /// Number of people shown.
     pub people: usize,
-    /// Whether all colours of everybody have come.
+    /// Whether all colours of all people have arrived.
     pub is_complete: bool,
+    /// Run time of the drawing.
     pub took: Duration,
 }
 
@@ -50,12 +57,12 @@ struct Shared {
 #[derive(Debug, Default)]
 struct State {
     request: Option<Request>,
-    drawn: Option<Drawn>,
+    drawn: Option<PaintedView>,
     fault: Option<String>,
     is_ended: bool,
 }
 
-/// The drawing thread.
+/// Drawing thread.
 pub(crate) struct Painter {
     shared: Arc<Shared>,
     thread: SupervisedThread,
@@ -63,7 +70,7 @@ pub(crate) struct Painter {
 }
 
 impl Painter {
-    /// Starts it; `finished` is called after each view.
+    /// Starts the thread; `finished` is called after each view.
     pub fn start(
         gpu: &GpuContext,
         receiver: Arc<Receiver>,
@@ -80,7 +87,7 @@ impl Painter {
                 match drawn {
                     Ok(None) => continue,
                     Ok(Some(drawn)) => (state.drawn, state.fault) = (Some(drawn), None),
-                    // A device that is lost is not opened again here: the window says so.
+                    // A lost device is not opened again here: the window reports it.
                     Err(error) => {
                         last = None;
                         state.fault = Some(error.to_string());
@@ -93,14 +100,14 @@ impl Painter {
         Ok(Self { shared, thread: SupervisedThread::start("draw", work)?, adapter })
     }
 
-    /// Asks for a view; one that waits is replaced.
+    /// Requests a view, which replaces a waiting one.
     pub fn ask(&self, request: Request) {
         self.shared.lock().request = Some(request);
         self.shared.changed.notify_all();
     }
 
-    /// Takes the view that was drawn last, once, and what kept one from being drawn.
-    pub fn take(&self) -> (Option<Drawn>, Option<String>) {
+    /// Takes the last view, once, and returns the fault that prevents drawing.
+    pub fn take(&self) -> (Option<PaintedView>, Option<String>) {
         let mut state = self.shared.lock();
         (state.drawn.take(), state.fault.clone())
     }
@@ -123,7 +130,7 @@ impl Shared {
         lock(&self.state)
     }
 
-    /// Waits for the next request; None at the end.
+    /// Waits for the next request; `None` at the end.
     fn next(&self) -> Option<Request> {
         let mut state = self.lock();
         loop {
@@ -138,28 +145,28 @@ impl Shared {
     }
 }
 
-/// Everything that a view depends on: the same again need not be drawn. Of each person its number, stamp and colours.
+/// Content of a view: the request, and the number, stamp and colour count of each person. Equal content need not be drawn again.
 type Content = (Request, Vec<(u32, Stamp, u64)>);
 
-/// A person as it is drawn; memory is kept from one view to the next.
+/// Posed person; memory is kept from one view to the next.
 #[derive(Debug, Default)]
 struct PosedPerson {
     posed: Posed,
     axes: PosedAxes,
-    /// Whether it is an avatar, whose axes hold.
+    /// Whether the person is an avatar, so that `axes` is valid.
     is_avatar: bool,
     colors: Arc<Vec<[f32; 4]>>,
 }
 
-/// Draws a view, unless it would be the same as the `last` one.
+/// Draws a view, unless it would equal the `last` one.
 fn draw(
     gpu: &GpuContext,
-    scene: &mut Option<Scene>,
+    scene: &mut Option<PeopleScene>,
     posed: &mut Vec<PosedPerson>,
     receiver: &Receiver,
     request: &Request,
     last: &mut Option<Content>,
-) -> Result<Option<Drawn>, flyrig_gpu::GpuError> {
+) -> Result<Option<PaintedView>, flyrig_gpu::GpuError> {
     let (start, now) = (Instant::now(), clock_secs());
     let (mut shown, mut place, mut is_complete, mut stamp) = (0, None, true, None);
     {
@@ -192,7 +199,7 @@ fn draw(
     }
     let scene = match scene {
         Some(scene) => scene,
-        none => none.insert(Scene::new(gpu)?),
+        none => none.insert(PeopleScene::new(gpu)?),
     };
     scene.set_people(posed[..shown].iter().map(|PosedPerson { posed, axes, is_avatar, colors }| ShownPerson {
         posed,
@@ -201,7 +208,7 @@ fn draw(
     }))?;
     let view = scene.draw(&request.camera)?;
     let backdrop = vec![BACKDROP; view.width as usize * view.height as usize * 3];
-    Ok(Some(Drawn {
+    Ok(Some(PaintedView {
         width: view.width,
         height: view.height,
         rgb: composite_over(&view.rgba, &backdrop),

@@ -1,4 +1,4 @@
-//! Keeps people, cameras and statistics as they come from a rig.
+//! Receiver of people, cameras and statistics of a rig.
 
 use std::{
     collections::VecDeque,
@@ -14,41 +14,41 @@ use flyrig_transport::{
     FetchedTemplate, Interests, PersonMessage, RigStats, Subscriber, TemplateFetcher, TransportConfig, TransportError,
 };
 use flyrig_types::{Rig, SupervisedThread, ThreadHealth, lock};
-use flyrig_viewing::{People, Taken};
+use flyrig_viewing::{Ingested, People};
 
-/// How long a message is waited for.
+/// Time limit of waiting for a message.
 const PATIENCE: Duration = Duration::from_millis(50);
 
-/// How often statistics and calibration are looked at.
-const LOOK_EVERY: Duration = Duration::from_millis(250);
-/// Rates are means over this time.
+/// Interval between checks of statistics and calibration.
+const CHECK_EVERY: Duration = Duration::from_millis(250);
+/// Time over which rates are averaged.
 const RATE_OVER: Duration = Duration::from_secs(2);
 
-/// State of a rig as it was received; lock it briefly.
+/// Received state of a rig; lock it briefly.
 #[derive(Debug, Default)]
 pub struct ReceiverState {
-    /// People; their clock is [`clock_secs`].
+    /// People, whose clock is [`clock_secs`].
     pub people: People,
-    /// The rig's cameras and its up.
+    /// Cameras and up direction of the rig.
     pub rig: Option<Rig>,
-    /// The rig's statistics, about every second.
+    /// Statistics of the rig, updated about every second.
     pub stats: Option<RigStats>,
-    /// The last thing that went wrong, and when.
+    /// Time and text of the last problem.
     pub problem: Option<(Instant, String)>,
-    /// Number of publishers of this rig that live now.
+    /// Number of live publishers of this rig.
     pub publishers: usize,
-    /// Reason why the rig does not admit the key, while it does not.
+    /// Why the rig rejects the key; `None` once it accepts it.
     pub refusal: Option<String>,
-    /// Layers of colours that come, from the coarsest.
+    /// Number of subscribed colour layers, from the coarsest.
     pub color_layers: usize,
-    /// Age of the newest motion when it came, seconds, and whether both ends run on one host so that it is exact.
+    /// Age of the newest motion at its arrival, seconds, and whether it is exact because both ends run on one host.
     pub age: Option<(f64, bool)>,
-    /// Arrival, bytes and whether it was a motion, of the last messages.
+    /// Arrival and bytes of the last messages, and whether each was a motion.
     recent: VecDeque<(Instant, usize, bool)>,
 }
 
 impl ReceiverState {
-    /// Returns bytes and motions a second.
+    /// Returns the rates of bytes and motions, per second.
     #[must_use]
     pub fn rates(&self, now: Instant) -> (f64, f64) {
         let recent = self.recent.iter().filter(|(at, ..)| now.saturating_duration_since(*at) < RATE_OVER);
@@ -57,7 +57,7 @@ impl ReceiverState {
         (bytes as f64 / RATE_OVER.as_secs_f64(), f64::from(motions) / RATE_OVER.as_secs_f64())
     }
 
-    /// Describes in words what keeps people from being shown; None while somebody is.
+    /// Explains why no people are shown; `None` while there are.
     #[must_use]
     pub fn trouble(&self, rig: &str, endpoint: &str) -> Option<String> {
         if self.publishers == 0 {
@@ -69,17 +69,18 @@ impl ReceiverState {
             return Some("Waiting for the rig's calibration".to_owned());
         }
         if self.people.is_empty() {
-            return Some("The rig is up; nobody has been seen yet".to_owned());
+            return Some("The rig is running; no person has been seen yet".to_owned());
         }
         None
     }
 
-    /// Returns the age of a capture time, seconds; None where no clock of this host is known for it.
+    /// Returns the age of a capture time, seconds; `None` where no clock of this host is known for it.
     #[must_use]
     pub fn age_of(&self, capture_nanos: i64) -> Option<f64> {
         age_secs(capture_nanos, self.stats.as_ref().and_then(|stats| stats.clock_offset_nanos))
     }
 
+    /// Records a problem.
     fn complain(&mut self, text: String) {
         tracing::debug!("{text}");
         self.problem = Some((Instant::now(), text));
@@ -93,7 +94,7 @@ impl ReceiverState {
     }
 }
 
-/// Receives on a thread of its own until it is dropped.
+/// Receiver on a thread of its own, until it is dropped.
 pub struct Receiver {
     state: Arc<Mutex<ReceiverState>>,
     stop: Arc<AtomicBool>,
@@ -101,10 +102,10 @@ pub struct Receiver {
 }
 
 impl Receiver {
-    /// Connects to a rig, which may come later. `arrived` is called after each motion that came.
+    /// Connects to a rig, which may start later. `arrived` is called after each motion.
     ///
     /// # Errors
-    /// [`TransportError`] when the session cannot be opened or no thread started.
+    /// [`TransportError`] when the session cannot be opened or the thread cannot be started.
     pub fn start(config: &TransportConfig, arrived: impl Fn() + Send + 'static) -> Result<Self, TransportError> {
         let interests = Interests { people: true, stats: true, ..Interests::default() };
         let subscriber = Subscriber::open(config, &interests)?;
@@ -112,9 +113,9 @@ impl Receiver {
         let (state, stop) = (Arc::new(Mutex::new(ReceiverState::default())), Arc::new(AtomicBool::new(false)));
         let (shared, ended) = (Arc::clone(&state), Arc::clone(&stop));
         let work = move || {
-            // Begun anew after a panic: what it left behind may be anything.
+            // After a panic the state may be inconsistent.
             lock(&shared).people.clear();
-            let mut link = Link { subscriber: &subscriber, state: &shared, templates: &mut templates, looked: None };
+            let mut link = Link { subscriber: &subscriber, state: &shared, templates: &mut templates, checked: None };
             while !ended.load(Ordering::Relaxed) {
                 link.turn(&arrived);
             }
@@ -127,12 +128,12 @@ impl Receiver {
         Ok(Self { state, stop, thread })
     }
 
-    /// The state as it is now.
+    /// Locks and returns the present state.
     pub fn state(&self) -> MutexGuard<'_, ReceiverState> {
         lock(&self.state)
     }
 
-    /// Health of the thread.
+    /// Returns the health of the thread.
     #[must_use]
     pub fn thread(&self) -> ThreadHealth {
         self.thread.health()
@@ -151,18 +152,18 @@ struct Link<'a> {
     subscriber: &'a Subscriber,
     state: &'a Mutex<ReceiverState>,
     templates: &'a mut TemplateFetcher,
-    /// When statistics and calibration were looked at last.
-    looked: Option<Instant>,
+    /// Time of the last check of statistics and calibration.
+    checked: Option<Instant>,
 }
 
 impl Link<'_> {
     fn turn(&mut self, arrived: &impl Fn()) {
-        if self.looked.is_none_or(|at| at.elapsed() >= LOOK_EVERY) {
-            self.looked = Some(Instant::now());
-            self.look();
+        if self.checked.is_none_or(|at| at.elapsed() >= CHECK_EVERY) {
+            self.checked = Some(Instant::now());
+            self.ingest_status();
         }
         match self.templates.take() {
-            Ok(Some(fetched)) => self.meet(&fetched),
+            Ok(Some(fetched)) => self.set_template(&fetched),
             Ok(None) => {}
             Err(error) => lock(self.state).complain(error.to_string()),
         }
@@ -177,12 +178,12 @@ impl Link<'_> {
                     if is_motion {
                         let is_exact = received.latency_is_exact;
                         let own_clock = is_exact.then(|| state.age_of(capture_nanos)).flatten();
-                        // Of another host only the way since the publisher's hand-in is known.
-                        let way = received.latency_nanos as f64 / 1e9;
-                        state.age = Some((own_clock.unwrap_or(way), own_clock.is_some()));
+                        // For another host only the latency since the publisher's hand-in is known.
+                        let latency = received.latency_nanos as f64 / 1e9;
+                        state.age = Some((own_clock.unwrap_or(latency), own_clock.is_some()));
                     }
                 }
-                self.take(&received.body);
+                self.ingest(&received.body);
                 if is_motion {
                     arrived();
                 }
@@ -192,8 +193,8 @@ impl Link<'_> {
         }
     }
 
-    /// Takes in statistics and calibration.
-    fn look(&self) {
+    /// Ingests statistics and calibration.
+    fn ingest_status(&self) {
         let stats = self.subscriber.next_stats(Duration::ZERO);
         let rig = self.subscriber.rig(Duration::ZERO);
         let mut state = lock(self.state);
@@ -211,23 +212,24 @@ impl Link<'_> {
         }
     }
 
-    fn take(&mut self, message: &PersonMessage) {
+    /// Ingests a message of the person stream.
+    fn ingest(&mut self, message: &PersonMessage) {
         let is_motion = message.layer.is_none();
-        let taken = lock(self.state).people.take(message.person, is_motion, &message.bytes, clock_secs());
-        match taken {
-            // Colours wait for the motion beside them, which is shown as soon as its template is there.
-            Ok(Taken::Needs(template)) if is_motion => self.templates.ask(message.person, template),
+        let ingested = lock(self.state).people.ingest(message.person, is_motion, &message.bytes, clock_secs());
+        match ingested {
+            // Colours wait for the motion beside them, which is shown as soon as its template has arrived.
+            Ok(Ingested::Needs(template)) if is_motion => self.templates.ask(message.person, template),
             Ok(_) => {}
             Err(error) => lock(self.state).complain(format!("person {}: {error}", message.person)),
         }
     }
 
-    /// Makes the people of a template.
-    fn meet(&mut self, fetched: &FetchedTemplate) {
+    /// Sets a template for its people.
+    fn set_template(&mut self, fetched: &FetchedTemplate) {
         match StreamTemplate::decode(&fetched.bytes).map(Arc::new) {
             Ok(template) => {
                 let mut state = lock(self.state);
-                fetched.people.iter().for_each(|person| state.people.meet(*person, Arc::clone(&template)));
+                fetched.people.iter().for_each(|person| state.people.set_template(*person, Arc::clone(&template)));
             }
             Err(error) => {
                 self.templates.refuse(fetched.hash);
@@ -237,14 +239,15 @@ impl Link<'_> {
     }
 }
 
-/// This host's `CLOCK_MONOTONIC`, seconds: the clock that [`ReceiverState::people`] is kept by.
+/// Returns this host's `CLOCK_MONOTONIC`, seconds, the clock of [`ReceiverState::people`].
 #[must_use]
 pub fn clock_secs() -> f64 {
     let now = rustix::time::clock_gettime(rustix::time::ClockId::Monotonic);
     now.tv_sec as f64 + now.tv_nsec as f64 / 1e9
 }
 
-/// Age of a capture time, seconds: of this host's `CLOCK_MONOTONIC`, or of a clock that is `offset_nanos` behind it. None where neither can be.
+/// Returns the age of a capture time, seconds, by this host's `CLOCK_MONOTONIC`, or by a clock that is `offset_nanos` behind it; `None` where
+/// neither is plausible.
 #[must_use]
 pub fn age_secs(capture_nanos: i64, offset_nanos: Option<i64>) -> Option<f64> {
     let now = clock_secs();

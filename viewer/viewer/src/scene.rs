@@ -1,60 +1,35 @@
-//! People of the stream, drawn into a view.
+//! Drawing of the people of the stream.
 
 use flyrig_gpu::{GpuContext, GpuError};
 use flyrig_renderer::{GaussianBuffers, ViewPainter};
-use flyrig_stream::{Posed, PosedAxes};
 use flyrig_types::{Camera, RenderedView};
 
-use crate::ellipsoids::EllipsoidBuffers;
+use crate::{ellipsoids::EllipsoidBuffers, shown_person::ShownPerson};
 
-/// One person to draw.
-#[derive(Debug, Clone, Copy)]
-pub struct ShownPerson<'a> {
-    /// Centres and normals.
-    pub posed: &'a Posed,
-    /// Linear RGB and opacity of as many Gaussians.
-    pub colors: &'a [[f32; 4]],
-    /// Axes of as many Gaussians; None where they are isotropic.
-    pub axes: Option<&'a PosedAxes>,
-}
-
-impl<'a> From<(&'a Posed, &'a [[f32; 4]])> for ShownPerson<'a> {
-    fn from((posed, colors): (&'a Posed, &'a [[f32; 4]])) -> Self {
-        Self { posed, colors, axes: None }
-    }
-}
-
-impl ShownPerson<'_> {
-    /// Number of Gaussians that all lists have.
-    pub(crate) fn count(&self) -> usize {
-        self.posed.center_scale.len().min(self.posed.normal.len()).min(self.colors.len())
-    }
-}
-
-/// A rasteriser with room for the people that are shown.
+/// Rasteriser with the Gaussians of the people to draw.
 #[derive(Debug)]
-pub struct Scene {
+pub struct PeopleScene {
     gpu: GpuContext,
     painter: ViewPainter,
     gaussians: GaussianBuffers,
-    /// In place of those where somebody is an avatar.
+    /// Anisotropic Gaussians, used instead where a person is an avatar.
     ellipsoids: Option<EllipsoidBuffers>,
 }
 
-impl Scene {
-    /// An empty scene.
+impl PeopleScene {
+    /// Creates an empty scene.
     ///
     /// # Errors
-    /// [`GpuError::TooLarge`].
+    /// [`GpuError::TooLarge`] on a device without room for its buffers.
     pub fn new(gpu: &GpuContext) -> Result<Self, GpuError> {
         let (painter, gaussians) = (ViewPainter::new(gpu, 1)?, GaussianBuffers::zeroed(gpu, 1)?);
         Ok(Self { gpu: gpu.clone(), painter, gaussians, ellipsoids: None })
     }
 
-    /// Puts people into the scene, in place of those before. Once one of them is an avatar, all are drawn as Gaussians of three axes.
+    /// Replaces the people of the scene. With an avatar among them, all are drawn as anisotropic Gaussians.
     ///
     /// # Errors
-    /// [`GpuError::TooLarge`].
+    /// [`GpuError::TooLarge`] for more Gaussians than a buffer holds.
     pub fn set_people<'a, P: Into<ShownPerson<'a>>>(
         &mut self,
         people: impl IntoIterator<Item = P>,
@@ -82,7 +57,7 @@ impl Scene {
     }
 
     fn write(&mut self, centers: &[[f32; 4]], normals: &[[f32; 4]], colors: &[[f32; 4]]) -> Result<(), GpuError> {
-        // A buffer has at least one element: zero, which is not drawn.
+        // A buffer has at least one element; zeros are not drawn.
         if self.gaussians.count() != centers.len().max(1) || centers.is_empty() {
             self.gaussians = GaussianBuffers::zeroed(&self.gpu, centers.len().max(1))?;
         }
@@ -94,10 +69,10 @@ impl Scene {
         Ok(())
     }
 
-    /// Draws the people as a camera sees them, at its size; straight alpha.
+    /// Draws the people for a camera, at its size; straight alpha.
     ///
     /// # Errors
-    /// [`GpuError`].
+    /// [`GpuError`] of the device.
     pub fn draw(&mut self, camera: &Camera) -> Result<RenderedView, GpuError> {
         match &mut self.ellipsoids {
             Some(ellipsoids) => self.painter.draw(ellipsoids.seen_by(&self.gpu, camera), camera),

@@ -1,4 +1,4 @@
-//! The window.
+//! Window of the viewer.
 
 use std::{
     collections::VecDeque,
@@ -16,23 +16,23 @@ use flyrig_viewing::Navigation;
 use glam::DVec3;
 
 use crate::{
-    Receiver, ReceiverState,
-    painter::{Drawn, Painter, Request},
+    painter::{PaintedView, Painter, Request},
+    receiver::{Receiver, ReceiverState},
 };
 
-/// Largest view that is drawn without a graphics adapter, pixels; larger windows show it scaled.
+/// Largest view without a graphics adapter, pixels; larger windows show it scaled.
 const MOST_PIXELS_ON_PROCESSOR: f64 = 640.0 * 480.0;
-/// Turn of a drag over the height of the window, radians.
+/// Rotation by a drag over the height of the window, radians.
 const DRAG_TURN: f64 = std::f64::consts::PI;
-/// Speed of flying, in distances to the target a second.
+/// Speed of flying, distances to the target per second.
 const FLY_SPEED: f64 = 0.5;
-/// How long a problem is shown.
+/// Time for which a problem is shown.
 const SHOW_PROBLEM: Duration = Duration::from_secs(5);
-/// How often the window looks around when nothing comes.
+/// Interval of updates while nothing arrives.
 const IDLE: Duration = Duration::from_millis(250);
-/// Rates of shown frames are means over this time.
+/// Time over which the rate of shown frames is averaged.
 const RATE_OVER: Duration = Duration::from_secs(2);
-/// Keys of the first cameras.
+/// Keys that jump to the first cameras.
 const CAMERA_KEYS: [egui::Key; 9] = [
     egui::Key::Num1,
     egui::Key::Num2,
@@ -49,60 +49,60 @@ const HELP: &str = "drag: turn   right drag: shift   wheel: nearer   W A S D Q E
 /// Options of the window.
 #[derive(Debug, Clone)]
 pub struct ViewOptions {
-    /// The rig and where it is.
+    /// Name and address of the rig.
     pub transport: TransportConfig,
-    /// Shows the newest frame at once, in place of smooth motion a frame and a half later.
+    /// Whether to show the newest frame at once instead of smooth motion a frame and a half later.
     pub lowest_latency: bool,
-    /// Follows the person from the start.
+    /// Whether to follow the person from the start.
     pub follow: bool,
-    /// Camera to stand at first, by name.
+    /// Name of the camera to start at.
     pub camera: Option<String>,
     /// Inner size of the window, points.
     pub size: [u32; 2],
-    /// Returns the window's content as soon as a person is shown with all colours, and closes it.
+    /// Whether to return the window's content as soon as a person is shown with all colours, and to close it.
     pub screenshot: bool,
-    /// Closes after so many seconds.
+    /// Time after which the window closes, seconds.
     pub seconds: Option<f64>,
 }
 
-/// RGB pixels of the window.
+/// Content of the window.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Screenshot {
-    /// Pixels.
+    /// Width, pixels.
     pub width: u32,
-    /// Pixels.
+    /// Height, pixels.
     pub height: u32,
-    /// Row by row.
+    /// sRGB bytes, row by row.
     pub rgb: Vec<u8>,
 }
 
-/// Why nothing is shown.
+/// Error of the window.
 #[derive(Debug, thiserror::Error)]
 pub enum ViewerError {
-    /// No session.
+    /// Error of the session.
     #[error(transparent)]
     Transport(#[from] TransportError),
-    /// No graphics.
+    /// Error of the graphics device.
     #[error(transparent)]
     Gpu(#[from] GpuError),
-    /// No window.
+    /// Failure to open a window.
     #[error(
         "cannot open a window: {0}. Run it in a desktop session (DISPLAY or WAYLAND_DISPLAY is set), or save images without a \
          window: flyrig watch --out FOLDER"
     )]
     Window(String),
-    /// A thread that the system did not start.
+    /// Failure to start a thread.
     #[error("cannot start a thread: {0}; end other programs, or raise the limit of processes (ulimit -u)")]
     Thread(#[from] std::io::Error),
-    /// Time was up before there was anything to save.
+    /// Expiry of the time before there was anything to save.
     #[error("no screenshot in {0:.0} s: {1}")]
     NothingShown(f64, String),
 }
 
-/// Opens the window and shows the rig's people until it is closed. Returns the screenshot, where one is asked for.
+/// Opens the window and shows the rig's people until it is closed. Returns the screenshot where one is requested.
 ///
 /// # Errors
-/// [`ViewerError`].
+/// [`ViewerError`] without a session, device or window.
 pub fn open_window(options: ViewOptions, gpu: &GpuContext) -> Result<Option<Screenshot>, ViewerError> {
     // The receiver starts first: a bad endpoint is reported without a window.
     let repaint: Arc<OnceLock<egui::Context>> = Arc::default();
@@ -167,7 +167,7 @@ pub fn open_window(options: ViewOptions, gpu: &GpuContext) -> Result<Option<Scre
 /// State of the screen.
 #[derive(Debug, Default)]
 struct Shown {
-    /// When a new frame of the rig was shown.
+    /// Times at which new frames of the rig were shown.
     changes: VecDeque<Instant>,
     frame: u64,
     age_secs: Option<f64>,
@@ -183,7 +183,7 @@ struct View {
     options: ViewOptions,
     receiver: Arc<Receiver>,
     painter: Painter,
-    /// None until the rig's cameras are known.
+    /// Viewpoint; `None` until the rig's cameras are known.
     navigation: Option<Navigation>,
     follows: bool,
     hides: bool,
@@ -231,7 +231,7 @@ impl eframe::App for View {
 }
 
 impl View {
-    /// Stands somewhere as soon as the rig's cameras are known.
+    /// Creates the viewpoint as soon as the rig's cameras are known.
     fn start_navigation(&mut self) {
         if self.navigation.is_some() {
             return;
@@ -289,7 +289,7 @@ impl View {
     fn take_drawn(&mut self, context: &egui::Context, now: Instant) {
         let (drawn, fault) = self.painter.take();
         self.shown.fault = fault;
-        let Some(Drawn { width, height, rgb, frame, age_secs, place, people, is_complete, took }) = drawn else {
+        let Some(PaintedView { width, height, rgb, frame, age_secs, place, people, is_complete, took }) = drawn else {
             return;
         };
         let image = egui::ColorImage::from_rgb([width as usize, height as usize], &rgb);
@@ -328,13 +328,13 @@ impl View {
             lines.push((trouble, true));
         } else {
             let age = match (self.shown.age_secs, state.age) {
-                // It grows until something new is drawn.
+                // The age grows until a new frame is drawn.
                 (Some(age), _) => {
                     let since = self.shown.drawn_at.map_or(0.0, |at| now.duration_since(at).as_secs_f64());
                     format!("age {:.0} ms", 1e3 * (age + since))
                 }
-                // Another host's clock, or a recording's: the way alone is known.
-                (None, Some((way, _))) => format!("{:.0} ms on the way", 1e3 * way),
+                // By another host's clock, or a recording's, only the latency is known.
+                (None, Some((latency, _))) => format!("latency {:.0} ms", 1e3 * latency),
                 (None, None) => "age unknown".to_owned(),
             };
             lines.push((
@@ -347,11 +347,11 @@ impl View {
                 false,
             ));
             lines.extend(people_lines(&state, self.shown.people));
-            // An avatar brings its colours.
+            // An avatar's colours are part of it.
             let are_colors_sent = state.people.iter().any(|(_, person)| !person.template().is_avatar());
             if are_colors_sent && state.color_layers < LAYERS {
                 let layers = state.color_layers;
-                lines.push((format!("colours: {layers} of {LAYERS} layers, as many as the line carries"), false));
+                lines.push((format!("colours: {layers} of {LAYERS} layers, as many as the network carries"), false));
             }
         }
         if let Some((_, text)) = state.problem.as_ref().filter(|(at, _)| now.duration_since(*at) < SHOW_PROBLEM) {
@@ -379,7 +379,7 @@ impl View {
         painter.galley(bottom, hint, faint);
     }
 
-    /// Asks for a screenshot as soon as somebody is shown completely.
+    /// Requests a screenshot as soon as a person is shown with all colours.
     fn take_shot(&mut self, context: &egui::Context) {
         if !self.options.screenshot || self.asked_for_shot || !self.shown.is_complete {
             return;
@@ -396,7 +396,7 @@ impl View {
     }
 }
 
-/// Tracking quality of every person; true for trouble.
+/// Returns a line on the tracking quality of each person, and whether it reports a problem.
 fn people_lines(state: &ReceiverState, shown: usize) -> Vec<(String, bool)> {
     let Some(stats) = &state.stats else { return Vec::new() };
     let mut lines: Vec<(String, bool)> = stats

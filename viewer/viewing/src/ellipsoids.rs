@@ -1,45 +1,46 @@
-//! Gaussians of three axes, of people of whom one at least is an avatar.
+//! Anisotropic Gaussians of people, at least one of whom is an avatar.
 
 use flyrig_stream::PosedAxes;
 use glam::{Vec3, Vec4};
 
-/// Cosine between the normal and the line of sight above which an isotropic Gaussian is not drawn; as in the rig's own drawing.
+/// Cosine between normal and line of sight above which an isotropic Gaussian is not drawn; as on the rig.
 pub const BACKFACING_COSINE: f32 = 0.35;
-/// The same for a Gaussian of an avatar, as `flyrig avatar render` has it: its opacity is below 1, so that the far side would show through.
+/// Cosine above which a Gaussian of an avatar is not drawn, as in `flyrig avatar render`: its opacity is below 1, so that the far side
+/// would show through.
 const AVATAR_BACKFACING_COSINE: f32 = 0.7;
 
-/// Returns whether a surface of this normal, of any length, faces away along a line of sight; false for numbers that are not finite.
+/// Returns whether a surface with this normal, of any length, faces away along a line of sight; false for non-finite numbers.
 #[must_use]
 pub fn faces_away(normal: Vec3, sight: Vec3, cosine: f32) -> bool {
     let along = normal.dot(sight);
     along > 0.0 && along * along > cosine * cosine * normal.length_squared() * sight.length_squared()
 }
 
-/// Shapes of everybody's Gaussians, one person after the other; centres and normals are in lists of their owner in the same order.
+/// Shapes of the Gaussians of all people, one person after the other; the owner keeps centres and normals in the same order.
 #[derive(Debug, Clone, Default)]
 pub struct Ellipsoids {
     scale_opacity: Vec<[f32; 4]>,
     rotation: Vec<[f32; 4]>,
-    /// Cosine of each from which it faces away.
+    /// Cosine above which each Gaussian faces away.
     backfacing: Vec<f32>,
     seen: Vec<[f32; 4]>,
 }
 
 impl Ellipsoids {
-    /// Removes everybody; memory is kept.
+    /// Removes all people; memory is kept.
     pub fn clear(&mut self) {
         [&mut self.scale_opacity, &mut self.rotation, &mut self.seen].into_iter().for_each(Vec::clear);
         self.backfacing.clear();
     }
 
-    /// Whether there is nobody.
+    /// Returns whether there are no people.
     #[must_use]
     pub fn is_empty(&self) -> bool {
         self.rotation.is_empty()
     }
 
-    /// Appends a person with as many Gaussians as `center_scale` and `colors` (linear RGB, opacity) both have: those of an avatar by its
-    /// axes, others, and an avatar with fewer axes, as spheres. One whose colour is not finite is not drawn.
+    /// Appends a person with as many Gaussians as `center_scale` and `colors` (linear RGB, opacity) both have: an avatar with its axes,
+    /// others, and an avatar with fewer axes, as spheres. A Gaussian whose colour is not finite is not drawn.
     pub fn push(&mut self, center_scale: &[[f32; 4]], colors: &[[f32; 4]], axes: Option<&PosedAxes>) {
         let rows = center_scale.iter().zip(colors);
         let count = rows.len();
@@ -56,14 +57,14 @@ impl Ellipsoids {
         }
     }
 
-    /// Unit quaternion x, y, z, w of each Gaussian: world from its axes.
+    /// Returns the unit quaternion x, y, z, w of each Gaussian: world from its axes.
     #[must_use]
     pub fn rotations(&self) -> &[[f32; 4]] {
         &self.rotation
     }
 
-    /// Returns the standard deviations along the axes, metres, and the opacity of each Gaussian as an eye sees it: 0 for one that faces
-    /// away. `centers` (metres, world) and `normals` are those of [`Self::push`], element for element; the fourth numbers do not matter.
+    /// Computes the standard deviations along the axes, metres, and the opacity of each Gaussian for an eye: 0 for one that faces away.
+    /// `centers` (metres, world) and `normals` match the Gaussians of [`Self::push`]; their fourth components are ignored.
     pub fn seen_from(&mut self, eye: Vec3, centers: &[[f32; 4]], normals: &[[f32; 4]]) -> &[[f32; 4]] {
         self.seen.clone_from(&self.scale_opacity);
         let rows = self.seen.iter_mut().zip(&self.backfacing).zip(centers.iter().zip(normals));
@@ -75,7 +76,7 @@ impl Ellipsoids {
         &self.seen
     }
 
-    /// Result of the last [`Self::seen_from`].
+    /// Returns the result of the last [`Self::seen_from`].
     #[must_use]
     pub fn seen(&self) -> &[[f32; 4]] {
         &self.seen
@@ -124,7 +125,7 @@ mod tests {
     }
 
     #[test]
-    fn poisoned_and_short_lists_are_no_harm() {
+    fn poisoned_and_short_lists_do_no_harm() {
         let row = [0.0, 0.0, 0.0, 0.01];
         let red = [1.0, 0.0, 0.0, 1.0];
         let short = PosedAxes { scale_opacity: vec![[0.5; 4]], rotation: vec![] };

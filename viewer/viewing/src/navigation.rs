@@ -1,33 +1,53 @@
-//! Where the viewer stands: orbit, fly, zoom, follow.
+//! Viewpoint of the viewer: orbit, fly, zoom, follow.
 
 use flyrig_types::{Camera, Intrinsics, Isometry, Rig};
 use glam::DVec3;
 
-/// Nearest and farthest distance to the point looked at, metres.
+/// Range of the distance to the target, metres.
 const DISTANCE_M: std::ops::RangeInclusive<f64> = 0.2..=50.0;
-/// Closest the line of sight comes to the vertical, radians.
+/// Least angle between line of sight and vertical, radians.
 const FROM_POLE: f64 = 0.05;
 /// Vertical field of view, radians.
 const FIELD: f64 = 0.8;
 
-/// A camera that turns around a point.
+/// Camera that turns around a target.
+///
+/// ```
+/// use flyrig_types::{Camera, ColorMatch, Intrinsics, Isometry, Rig};
+/// use flyrig_viewing::Navigation;
+/// use glam::DVec3;
+///
+/// let camera = Camera {
+///     id: "front".into(),
+///     time_offset_nanos: 0,
+///     color: ColorMatch::default(),
+///     intrinsics: Intrinsics::pinhole(640, 480, 500.0),
+///     camera_from_world: Isometry::look_at(DVec3::new(3.0, 0.0, 1.0), DVec3::Z, DVec3::Z),
+/// };
+/// let mut navigation = Navigation::new(&Rig { cameras: vec![camera], world_up: DVec3::Z });
+/// let before = navigation.distance();
+/// navigation.zoom(2.0);
+/// navigation.orbit(0.5, 0.1);
+/// assert!((navigation.distance() - before / 2.0).abs() < 1e-9);
+/// assert_eq!(navigation.camera(320, 240).size(), [320, 240]);
+/// ```
 #[derive(Debug, Clone, PartialEq)]
 pub struct Navigation {
     up: DVec3,
-    /// Point that is looked at, metres.
+    /// Point at the centre of the view, metres.
     target: DVec3,
     distance: f64,
-    /// Around the world's up, and above the horizon, radians.
+    /// Angles around the world's up and above the horizon, radians.
     heading: f64,
     elevation: f64,
     /// Vertical field of view, radians.
     field: f64,
-    /// Where the target was last set by following, to keep the viewer's own shift.
+    /// Position of the followed person at the last update, which keeps the viewer's own shift.
     followed: Option<DVec3>,
 }
 
 impl Navigation {
-    /// Beside the rig's first camera, looking at what the cameras look at.
+    /// Creates a viewpoint at the rig's first camera, with the cameras' common centre of attention as the target.
     #[must_use]
     pub fn new(rig: &Rig) -> Self {
         let mut navigation = Self {
@@ -45,14 +65,14 @@ impl Navigation {
         navigation
     }
 
-    /// Two horizontal axes that headings are measured from.
+    /// Returns two horizontal axes that headings are measured from.
     fn axes(&self) -> (DVec3, DVec3) {
         let x = if self.up.cross(DVec3::X).length() > 0.1 { DVec3::X } else { DVec3::Y };
         let x = (x - self.up * x.dot(self.up)).normalize();
         (x, self.up.cross(x))
     }
 
-    /// Stands at a point, looking at the same target.
+    /// Moves the eye to a point; the target stays.
     fn stand_at(&mut self, eye: DVec3) {
         let (x, y) = self.axes();
         let arm = eye - self.target;
@@ -62,26 +82,27 @@ impl Navigation {
         self.elevation = (arm.dot(self.up) / arm.length().max(1e-9)).clamp(-1.0, 1.0).asin().clamp(-most, most);
     }
 
+    /// Returns the vector from target to eye, metres.
     fn arm(&self) -> DVec3 {
         let (x, y) = self.axes();
         let level = x * self.heading.cos() + y * self.heading.sin();
         (level * self.elevation.cos() + self.up * self.elevation.sin()) * self.distance
     }
 
-    /// Distance to the point that is looked at, metres.
+    /// Returns the distance to the target, metres.
     #[must_use]
     pub fn distance(&self) -> f64 {
         self.distance
     }
 
-    /// Turns around the target; angles in radians.
+    /// Turns around the target, radians.
     pub fn orbit(&mut self, right: f64, down: f64) {
         let most = std::f64::consts::FRAC_PI_2 - FROM_POLE;
         self.heading = (self.heading - right) % std::f64::consts::TAU;
         self.elevation = (self.elevation + down).clamp(-most, most);
     }
 
-    /// Comes nearer by a factor above 1, goes away by one below.
+    /// Divides the distance to the target by a factor.
     pub fn zoom(&mut self, factor: f64) {
         if factor.is_finite() && factor > 0.0 {
             self.distance = (self.distance / factor).clamp(*DISTANCE_M.start(), *DISTANCE_M.end());
@@ -95,13 +116,13 @@ impl Navigation {
         self.target += aside * right + aside.cross(ahead) * up + ahead * forward;
     }
 
-    /// Shifts the view by a share of its height, so that the target follows the pointer.
+    /// Shifts the view by fractions of its height, so that the target follows the pointer.
     pub fn shift(&mut self, right: f64, down: f64) {
         let height = 2.0 * self.distance * (0.5 * self.field).tan();
         self.fly(-right * height, down * height, 0.0);
     }
 
-    /// Moves along with a person at `place`; the viewer's own shift against the person stays. `None` ends following.
+    /// Moves along with a person at `place`, world, metres; the viewer's own shift stays. `None` ends following.
     pub fn follow(&mut self, place: Option<DVec3>) {
         if let (Some(before), Some(now)) = (self.followed, place.filter(|place| place.is_finite())) {
             self.target += now - before;
@@ -109,7 +130,8 @@ impl Navigation {
         self.followed = place;
     }
 
-    /// Jumps to a camera of the rig: its place, its field of view, and the line of sight's point nearest to the target.
+    /// Jumps to a camera of the rig: its position, its field of view, and as the target the point of its optical axis nearest to the old
+    /// one.
     pub fn jump(&mut self, camera: &Camera) {
         let eye = camera.position();
         let ahead = camera.camera_from_world.rotation.inverse() * DVec3::Z;
@@ -120,7 +142,7 @@ impl Navigation {
         self.field = 2.0 * (0.5 * f64::from(lens.height) / lens.focal_px.y).atan();
     }
 
-    /// The camera of an image of this size.
+    /// Returns the camera of an image of this size, pixels.
     #[must_use]
     pub fn camera(&self, width: u32, height: u32) -> Camera {
         let focal = 0.5 * f64::from(height) / (0.5 * self.field).tan();

@@ -1,4 +1,4 @@
-//! Everybody of a stream.
+//! All people of a stream.
 
 use std::{
     collections::{BTreeMap, VecDeque},
@@ -7,23 +7,23 @@ use std::{
 
 use flyrig_stream::{StreamError, StreamTemplate, stamp_of};
 
-use crate::StreamPerson;
+use crate::person::StreamPerson;
 
-/// Most people that are kept; one more replaces the person of the lowest number.
+/// Largest number of people; one more replaces the person of the lowest number.
 pub const MAX_PEOPLE: usize = 32;
-/// Messages that wait for their template.
+/// Largest number of messages that wait for their template.
 const MAX_WAITING: usize = 64;
 
-/// What became of a message.
+/// Outcome of ingesting a message.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub enum Taken {
-    /// It changed its person.
+pub enum Ingested {
+    /// The message was applied to its person.
     Applied,
-    /// It waits for the template of this hash; [`People::meet`] applies it.
+    /// The message waits for the template of this hash; [`People::set_template`] applies it.
     Needs(u64),
 }
 
-/// A message whose template is on its way.
+/// Message whose template is on its way.
 #[derive(Debug, Clone)]
 struct Waiting {
     person: u32,
@@ -32,7 +32,7 @@ struct Waiting {
     arrived: f64,
 }
 
-/// People by their number.
+/// People by their number, and messages that wait for templates.
 #[derive(Debug, Default)]
 pub struct People {
     by_number: BTreeMap<u32, StreamPerson>,
@@ -40,20 +40,20 @@ pub struct People {
 }
 
 impl People {
-    /// Takes in a motion or a message of colours that came at `now`, seconds of the viewer's clock.
+    /// Ingests a motion or a message of colours that arrived at `now`, seconds of the viewer's clock.
     ///
     /// # Errors
     /// [`StreamError`] for damaged bytes.
-    pub fn take(&mut self, person: u32, is_motion: bool, bytes: &[u8], now: f64) -> Result<Taken, StreamError> {
+    pub fn ingest(&mut self, person: u32, is_motion: bool, bytes: &[u8], now: f64) -> Result<Ingested, StreamError> {
         match self.apply(person, is_motion, bytes, now) {
-            Ok(()) => Ok(Taken::Applied),
+            Ok(()) => Ok(Ingested::Applied),
             Err(StreamError::OtherTemplate { .. }) => {
                 let template = stamp_of(bytes)?.template;
                 self.waiting.push_back(Waiting { person, is_motion, bytes: bytes.to_vec(), arrived: now });
                 while self.waiting.len() > MAX_WAITING {
                     self.waiting.pop_front();
                 }
-                Ok(Taken::Needs(template))
+                Ok(Ingested::Needs(template))
             }
             Err(error) => Err(error),
         }
@@ -63,11 +63,11 @@ impl People {
         let Some(person) = self.by_number.get_mut(&person) else {
             return Err(StreamError::OtherTemplate { what: "message" });
         };
-        if is_motion { person.take_motion(bytes, now) } else { person.take_colors(bytes).map(drop) }
+        if is_motion { person.ingest_motion(bytes, now) } else { person.ingest_colors(bytes).map(drop) }
     }
 
-    /// Gives a person a template, and applies the messages that waited for it.
-    pub fn meet(&mut self, person: u32, template: Arc<StreamTemplate>) {
+    /// Sets the template of a person, and applies the messages that waited for it.
+    pub fn set_template(&mut self, person: u32, template: Arc<StreamTemplate>) {
         if self.by_number.len() >= MAX_PEOPLE && !self.by_number.contains_key(&person) {
             self.by_number.pop_first();
         }
@@ -79,34 +79,34 @@ impl People {
         self.waiting = others;
         let ours: VecDeque<Waiting> = ours;
         for waiting in ours {
-            // A damaged message is one that did not come.
+            // A damaged message counts as lost.
             drop(self.apply(person, waiting.is_motion, &waiting.bytes, waiting.arrived));
         }
     }
 
-    /// Forgets everybody.
+    /// Forgets all people.
     pub fn clear(&mut self) {
         *self = Self::default();
     }
 
-    /// Whether nobody's template has come.
+    /// Returns whether no template has arrived.
     #[must_use]
     pub fn is_empty(&self) -> bool {
         self.by_number.is_empty()
     }
 
-    /// A person.
+    /// Returns a person by number.
     #[must_use]
     pub fn get(&self, number: u32) -> Option<&StreamPerson> {
         self.by_number.get(&number)
     }
 
-    /// A person.
+    /// Returns a person by number.
     pub fn get_mut(&mut self, number: u32) -> Option<&mut StreamPerson> {
         self.by_number.get_mut(&number)
     }
 
-    /// People by growing number.
+    /// Iterates over the people by increasing number.
     pub fn iter(&self) -> impl Iterator<Item = (u32, &StreamPerson)> {
         self.by_number.iter().map(|(&number, person)| (number, person))
     }
@@ -120,7 +120,7 @@ mod tests {
 
     use super::*;
 
-    /// A person of a few Gaussians on one joint; `size` makes another template.
+    /// Creates a person of a few Gaussians on one joint; each `size` has its own template.
     fn person(size: f32) -> EncodedTemplate {
         let rows = [[1.0, 0.0, 0.0, 0.0], [0.0, 1.0, 0.0, 0.0], [0.0, 0.0, 1.0, 0.0]];
         let joints = [StreamJoint { parent: None, translation: [0.0; 3], joint_from_canonical: rows }];
@@ -147,14 +147,14 @@ mod tests {
         let colors = encoder.encode(Stamp::default(), &[[0.5, 0.2, 0.1, 1.0]; 40]);
         let mut people = People::default();
         for layer in &colors {
-            assert_eq!(people.take(3, false, layer, 0.0), Ok(Taken::Needs(hash)));
+            assert_eq!(people.ingest(3, false, layer, 0.0), Ok(Ingested::Needs(hash)));
         }
-        assert_eq!(people.take(3, true, &motion(&template, 1, 0.25), 0.0), Ok(Taken::Needs(hash)));
+        assert_eq!(people.ingest(3, true, &motion(&template, 1, 0.25), 0.0), Ok(Ingested::Needs(hash)));
         assert!(people.is_empty() && people.get(3).is_none());
         // Somebody else's template changes nothing for this one.
-        people.meet(4, Arc::new(other.template.clone()));
+        people.set_template(4, Arc::new(other.template.clone()));
         assert!(people.get(4).unwrap().motion_at(0.1, false).is_none());
-        people.meet(3, Arc::new(template.template.clone()));
+        people.set_template(3, Arc::new(template.template.clone()));
         let shown = people.get(3).unwrap();
         assert!(shown.is_complete() && shown.color_changes() == colors.len() as u64);
         let found = shown.motion_at(0.1, false).unwrap();
@@ -164,12 +164,12 @@ mod tests {
         assert!(colors.iter().all(|c| (c[0] - 0.5).abs() < 0.05 && (c[2] - 0.1).abs() < 0.05), "{:?}", colors[0]);
         // The rig takes another template for the same person.
         let hash = other.template.hash;
-        assert_eq!(people.take(3, true, &motion(&other, 2, 0.0), 0.2), Ok(Taken::Needs(hash)));
-        people.meet(3, Arc::new(other.template));
+        assert_eq!(people.ingest(3, true, &motion(&other, 2, 0.0), 0.2), Ok(Ingested::Needs(hash)));
+        people.set_template(3, Arc::new(other.template));
         assert_eq!(people.get(3).unwrap().motion_at(0.2, false).unwrap().stamp.template, hash);
         // Damaged bytes are an error and keep what is there.
-        people.take(3, true, b"FLM", 0.3).unwrap_err();
-        people.take(9, false, &[], 0.3).unwrap_err();
+        people.ingest(3, true, b"FLM", 0.3).unwrap_err();
+        people.ingest(9, false, &[], 0.3).unwrap_err();
         assert!(people.get(3).unwrap().motion_at(0.3, false).is_some());
     }
 
@@ -177,12 +177,12 @@ mod tests {
     fn motion_is_interpolated_and_ends() {
         let template = person(1.0);
         let mut people = People::default();
-        people.meet(0, Arc::new(template.template.clone()));
+        people.set_template(0, Arc::new(template.template.clone()));
         // A frame each 100 ms, 1 m/s; the rig's clock is 5 s behind the viewer's, and every other message is 30 ms late.
         for frame in 1..=10u64 {
             let late = 0.03 * (frame % 2) as f64;
             let message = motion(&template, frame, 0.1 * frame as f32);
-            assert_eq!(people.take(0, true, &message, 5.0 + 0.1 * frame as f64 + late), Ok(Taken::Applied));
+            assert_eq!(people.ingest(0, true, &message, 5.0 + 0.1 * frame as f64 + late), Ok(Ingested::Applied));
         }
         let place = |now: f64| people.get(0).unwrap().motion_at(now, true).map(|motion| motion.root_translation[0]);
         for now in [5.7, 5.78, 5.91] {
@@ -193,9 +193,9 @@ mod tests {
         assert!((place(7.0).unwrap() - 1.0).abs() < 1e-3);
         assert_eq!(place(9.5), None);
         // A late or repeated frame is left out; a rig that began anew is followed.
-        assert_eq!(people.take(0, true, &motion(&template, 4, 9.0), 6.1), Ok(Taken::Applied));
+        assert_eq!(people.ingest(0, true, &motion(&template, 4, 9.0), 6.1), Ok(Ingested::Applied));
         assert!(people.get(0).unwrap().motion_at(6.1, false).unwrap().root_translation[0] < 1.01);
-        assert_eq!(people.take(0, true, &motion(&template, 400, 9.0), 6.2), Ok(Taken::Applied));
+        assert_eq!(people.ingest(0, true, &motion(&template, 400, 9.0), 6.2), Ok(Ingested::Applied));
         assert!((people.get(0).unwrap().motion_at(6.2, true).unwrap().root_translation[0] - 9.0).abs() < 1e-3);
     }
 
@@ -204,9 +204,9 @@ mod tests {
         let (template, other) = (Arc::new(person(1.0).template), person(2.0));
         let mut people = People::default();
         for number in 0..100 {
-            people.meet(number, Arc::clone(&template));
+            people.set_template(number, Arc::clone(&template));
             let message = motion(&other, u64::from(number), 0.0);
-            assert!(matches!(people.take(number, true, &message, 0.0), Ok(Taken::Needs(_))));
+            assert!(matches!(people.ingest(number, true, &message, 0.0), Ok(Ingested::Needs(_))));
         }
         assert_eq!(people.iter().count(), MAX_PEOPLE);
         assert_eq!(people.waiting.len(), MAX_WAITING);

@@ -1,38 +1,69 @@
-//! One person of the stream, as it has come so far.
+//! One person of the stream.
 
 use std::{collections::VecDeque, sync::Arc};
 
 use flyrig_stream::{ColorDecoder, Motion, Posed, PosedAxes, Stamp, StreamError, StreamTemplate};
 
-/// Motions that are kept to interpolate between.
+/// Number of motions that are kept for interpolation.
 const KEPT: usize = 16;
-/// Longest delay that interpolation may add.
+/// Largest delay that interpolation adds.
 const MOST_DELAY_SECS: f64 = 0.5;
-/// How fast the estimate of the fastest way follows a clock that drifts, seconds a second.
+/// Rate at which the estimate of the least latency follows a drifting clock, seconds per second.
 const DRIFT: f64 = 1e-3;
-/// A person of whom no motion came for so long, and three intervals, is gone.
+/// Time without motion, in addition to three intervals, after which a person is gone.
 const GONE_AFTER_SECS: f64 = 3.0;
 
 /// Template, last motions and colours of one person.
+///
+/// ```
+/// use std::sync::Arc;
+///
+/// use flyrig_stream::{Motion, MotionEncoder, Posed, Stamp, StreamJoint, TemplateSource};
+/// use flyrig_viewing::StreamPerson;
+///
+/// let rows = [[1.0, 0.0, 0.0, 0.0], [0.0, 1.0, 0.0, 0.0], [0.0, 0.0, 1.0, 0.0]];
+/// let source = TemplateSource {
+///     joints: &[StreamJoint { parent: None, translation: [0.0; 3], joint_from_canonical: rows }],
+///     center_scale: &[[0.0, 0.0, 0.0, 0.01]],
+///     normals: &[[0.0, 0.0, 1.0]],
+///     skin: &[([0; 4], [1.0, 0.0, 0.0, 0.0])],
+///     node_weights: &[],
+///     nodes: &[],
+/// };
+/// let encoded = source.encode()?;
+/// let mut person = StreamPerson::new(Arc::new(encoded.template.clone()));
+/// let mut encoder = MotionEncoder::new(&encoded);
+/// for (frame, x) in [(0, 0.0), (1, 0.4)] {
+///     let stamp = Stamp { frame, capture_nanos: 100_000_000 * frame as i64, ..Stamp::default() };
+///     let rotations = vec![[0.0, 0.0, 0.0, 1.0]];
+///     let motion = Motion { stamp, root_translation: [x, 0.0, 0.0], joint_rotations: rotations, nodes: vec![] };
+///     person.ingest_motion(&encoder.encode(&motion)?, 0.1 * frame as f64)?;
+/// }
+/// let between = person.motion_at(0.2, true).unwrap_or_default();
+/// let mut posed = Posed::default();
+/// let colors = person.pose(&between, &mut posed);
+/// assert!((posed.center_scale[0][0] - 0.2).abs() < 1e-2 && colors.len() == 1);
+/// # Ok::<(), flyrig_stream::StreamError>(())
+/// ```
 #[derive(Debug)]
 pub struct StreamPerson {
     template: Arc<StreamTemplate>,
     decoder: ColorDecoder,
-    /// Shared with the views under way.
+    /// Linear colours, shared with the views under way.
     colors: Arc<Vec<[f32; 4]>>,
     colors_are_current: bool,
-    /// Counts the messages of colours.
+    /// Number of messages of colours.
     color_changes: u64,
-    /// Arrival, seconds of the viewer's clock, and motion.
+    /// Arrival by the viewer's clock, seconds, and motion.
     motions: VecDeque<(f64, Motion)>,
-    /// Smoothed time between motions, seconds of the rig's clock.
+    /// Smoothed time between motions by the rig's clock, seconds.
     interval: f64,
-    /// Least of arrival minus capture time: the fastest way, seconds.
+    /// Least latency: arrival minus capture time, seconds.
     fastest: Option<f64>,
 }
 
 impl StreamPerson {
-    /// A person nothing is known of but its template.
+    /// Creates a person of whom only the template is known.
     #[must_use]
     pub fn new(template: Arc<StreamTemplate>) -> Self {
         Self {
@@ -47,17 +78,17 @@ impl StreamPerson {
         }
     }
 
-    /// The template.
+    /// Returns the template.
     #[must_use]
     pub fn template(&self) -> &StreamTemplate {
         &self.template
     }
 
-    /// Takes in a motion that came at `now`, seconds of the viewer's clock; one that is older than the newest is left out.
+    /// Ingests a motion that arrived at `now`, seconds of the viewer's clock; motions older than the newest are ignored.
     ///
     /// # Errors
-    /// [`StreamError`].
-    pub fn take_motion(&mut self, bytes: &[u8], now: f64) -> Result<(), StreamError> {
+    /// As [`Motion::decode`].
+    pub fn ingest_motion(&mut self, bytes: &[u8], now: f64) -> Result<(), StreamError> {
         let motion = Motion::decode(bytes, &self.template)?;
         let capture = |motion: &Motion| motion.stamp.capture_nanos as f64 / 1e9;
         if let Some((_, last)) = self.motions.back() {
@@ -66,7 +97,7 @@ impl StreamPerson {
                 return Ok(());
             }
             if step <= 0.0 || step > 10.0 * GONE_AFTER_SECS {
-                // The rig began anew, or was away.
+                // The rig restarted, or was absent.
                 self.motions.clear();
                 (self.fastest, self.interval) = (None, 0.0);
             } else {
@@ -82,19 +113,19 @@ impl StreamPerson {
         Ok(())
     }
 
-    /// Takes in a layer of colours.
+    /// Ingests a layer of colours.
     ///
     /// # Errors
-    /// [`StreamError`].
-    pub fn take_colors(&mut self, bytes: &[u8]) -> Result<Stamp, StreamError> {
-        let stamp = self.decoder.take(bytes)?;
+    /// As [`ColorDecoder::ingest`].
+    pub fn ingest_colors(&mut self, bytes: &[u8]) -> Result<Stamp, StreamError> {
+        let stamp = self.decoder.ingest(bytes)?;
         self.colors_are_current = false;
         self.color_changes += 1;
         Ok(stamp)
     }
 
-    /// The motion to show at `now`: the newest, or interpolated one interval and a half later than the fastest message would
-    /// allow, so that the next one has usually come. None for a person who is gone.
+    /// Returns the motion to show at `now`: the newest, or interpolated with a delay of one interval and a half beyond the least latency, so
+    /// that the next motion has usually arrived. `None` for a person that is gone.
     #[must_use]
     pub fn motion_at(&self, now: f64, interpolate: bool) -> Option<Motion> {
         let (arrived, newest) = self.motions.back()?;
@@ -118,11 +149,11 @@ impl StreamPerson {
         })
     }
 
-    /// Poses the person and returns its colours, an element a Gaussian each.
+    /// Poses the person and returns its linear colours, one element per Gaussian each.
     pub fn pose(&mut self, motion: &Motion, posed: &mut Posed) -> Arc<Vec<[f32; 4]>> {
         self.template.pose(motion, posed);
         if self.template.is_avatar() {
-            // Its light shows them differently in each pose.
+            // The light changes the colours in each pose.
             self.template.avatar_colors(posed, Arc::make_mut(&mut self.colors));
             return Arc::clone(&self.colors);
         }
@@ -132,18 +163,18 @@ impl StreamPerson {
         Arc::clone(&self.colors)
     }
 
-    /// Poses the three axes of an avatar's Gaussians. Returns false for a person of isotropic ones.
+    /// Poses the axes of an avatar's Gaussians. Returns false for a person of isotropic Gaussians.
     pub fn pose_axes(&self, motion: &Motion, axes: &mut PosedAxes) -> bool {
         self.template.pose_axes(motion, axes)
     }
 
-    /// Whether every part of the person has its colours, down to the finest layer.
+    /// Returns whether every part of the person has its colours, down to the finest layer.
     #[must_use]
     pub fn is_complete(&self) -> bool {
         self.template.is_avatar() || (0..flyrig_stream::LAYERS).all(|layer| self.decoder.known(layer) >= 1.0)
     }
 
-    /// Number of colour messages so far: the same number means the same colours.
+    /// Returns the number of colour messages so far: an unchanged number means unchanged colours.
     #[must_use]
     pub fn color_changes(&self) -> u64 {
         self.color_changes

@@ -4,7 +4,7 @@
 const TEXELS = 1024; // Gaussians in a row of the data textures
 const FILTER_PX2 = 0.1; // RasterSettings::filter_variance_px2
 
-// Of isotropic Gaussians, or of those of three axes.
+// Vertex shader of isotropic or anisotropic Gaussians.
 const project = hasAxes => `#version 300 es
 precision highp float;
 precision highp sampler2D;
@@ -13,7 +13,7 @@ uniform sampler2D colors;
 uniform highp usampler2D order;
 ${hasAxes ? `uniform sampler2D scales;
 uniform sampler2D rotations;
-// Columns: the axes of a Gaussian of a unit quaternion, in the world.
+// Returns the axes of a Gaussian by its unit quaternion, as columns, in the world.
 mat3 axes(vec4 q) {
   vec3 d = q.xyz * q.xyz, w = q.w * q.xyz;
   float xy = q.x * q.y, yz = q.y * q.z, zx = q.z * q.x;
@@ -32,7 +32,7 @@ flat out vec3 paint;
 const float CUT = 1.0 / 255.0;
 void main() {
   gl_Position = vec4(2.0, 2.0, 2.0, 1.0);
-  // Four vertices a Gaussian.
+  // Four vertices per Gaussian.
   int rank = gl_VertexID / 4;
   vec2 corner = vec2(gl_VertexID & 1, (gl_VertexID >> 1) & 1) * 2.0 - 1.0;
   int index = int(texelFetch(order, ivec2(rank % ${TEXELS}, rank / ${TEXELS}), 0).r);
@@ -120,7 +120,7 @@ function program(gl, vertex, fragment) {
   } };
 }
 
-/** A drawing of one canvas. Make a new one after the context was lost. */
+/** Drawing of one canvas. Create a new one after the context was lost. */
 export class WebGl2Drawing {
   constructor(canvas) {
     [this.kind, this.sorts, this.isBusy] = ["WebGL2", false, false];
@@ -131,13 +131,13 @@ export class WebGl2Drawing {
     this.format = gl.getExtension("EXT_color_buffer_float") || gl.getExtension("EXT_color_buffer_half_float")
       ? gl.RGBA16F : gl.SRGB8_ALPHA8;
     this.splats = program(gl, project(false), BLEND);
-    this.ellipsoids = null; // the same for Gaussians of three axes, once there are some
+    this.ellipsoids = null; // program of anisotropic Gaussians, once there are some
     this.hasAxes = false;
     this.compose = program(gl, WHOLE, COMPOSE);
     // No attributes: vertices are numbered. Instances of four vertices would be slow on some drivers, most of all on software.
     this.vertices = gl.createVertexArray();
     this.indices = gl.createBuffer();
-    this.capacity = 0; // Gaussians that the indices are for
+    this.capacity = 0; // number of Gaussians that the indices cover
     this.order = { texture: gl.createTexture(), rows: 0 };
     this.centers = { texture: gl.createTexture(), rows: 0 };
     this.colors = { texture: gl.createTexture(), rows: 0 };
@@ -167,7 +167,7 @@ export class WebGl2Drawing {
     }
   }
 
-  /** Six indices for each of so many Gaussians. */
+  /** Writes six indices for each of a number of Gaussians. */
   reserve(count) {
     if (count <= this.capacity) return;
     const gl = this.gl;
@@ -182,7 +182,7 @@ export class WebGl2Drawing {
   setCenters(centers, normals, count) { this.upload(this.centers, centers, count, this.four); this.reserve(count); }
   setColors(floats, count) { this.upload(this.colors, floats, count, this.four); }
 
-  /** Rotations of the Gaussians' axes; null where all are isotropic. */
+  /** Sets the rotations of the Gaussians' axes; null where all are isotropic. */
   setRotations(rotations, count) {
     this.hasAxes = rotations !== null;
     if (!this.hasAxes) return;
@@ -190,7 +190,7 @@ export class WebGl2Drawing {
     this.upload(this.rotations, rotations, count, this.four);
   }
 
-  /** Standard deviations along the axes; opacities are those of the colours, and `order` leaves out who faces away. */
+  /** Sets the standard deviations along the axes; opacities are those of the colours, and `order` omits Gaussians that face away. */
   setScales(scales, count) { this.upload(this.scales, scales, count, this.four); }
 
   /** Draws the Gaussians of `order`, farthest first, with a camera of 19 numbers (viewer/page/src/page.rs). */

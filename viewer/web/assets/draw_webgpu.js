@@ -28,7 +28,7 @@ const ENTRIES = {
   sort: ["find_range", "count_digits", "scatter"], blend: ["blend"],
 };
 
-/** A graphics processor and the compiled kernels; null where there is none that is worth it. `takesSoftware`: a processor in disguise, too. */
+/** Opens a graphics processor and compiles the kernels; null where there is none. `takesSoftware` accepts a software adapter, too. */
 export async function openWebGpu(takesSoftware) {
   const adapter = await navigator.gpu?.requestAdapter({ powerPreference: "high-performance" });
   if (!adapter) return null;
@@ -47,14 +47,14 @@ export async function openWebGpu(takesSoftware) {
   return { device, kernels, numbers, frame, srgb: modules.srgb };
 }
 
-/** Workgroups in x and y for so many invocations, as flyrig_gpu::dispatch_1d. */
+/** Returns the workgroups in x and y for a number of invocations, as flyrig_gpu::dispatch_1d. */
 function groupsFor(items, lanes) {
   const groups = Math.max(1, Math.ceil(items / lanes));
   const rows = Math.ceil(groups / MOST_GROUPS);
   return [Math.ceil(groups / rows), rows];
 }
 
-/** A drawing of one canvas with what `openWebGpu` opened. Make a new one after `device.lost`. */
+/** Drawing of one canvas with the result of `openWebGpu`. Create a new one after `device.lost`. */
 export class WebGpuDrawing {
   constructor(canvas, { device, kernels, numbers, frame, srgb }) {
     Object.assign(this, { canvas, device, kernels, numbers, offsets: frame, sorts: true, kind: "WebGPU" });
@@ -68,14 +68,14 @@ export class WebGpuDrawing {
     this.buffers = new Map(); // by name
     this.count = 0;
     this.hasAxes = false;
-    this.planned = ""; // count, size and kind that the steps are for
+    this.planned = ""; // count, size and kind of the present steps
     this.waiting = 0; // images that the device has not finished
   }
 
-  /** Whether earlier images are still being drawn: more of them would only wait in the device's queue. */
+  /** Returns whether earlier images are still being drawn: more of them would only wait in the device's queue. */
   get isBusy() { return this.waiting > 1; }
 
-  /** The buffer of a name, with room for so many bytes; content is lost when it grows. */
+  /** Returns the buffer of a name with room for a number of bytes; the content is lost when it grows. */
   buffer(name, bytes, usage = 0) {
     const known = this.buffers.get(name);
     if (known && known.size >= bytes) return known;
@@ -97,16 +97,16 @@ export class WebGpuDrawing {
 
   setColors(colors) { this.write("colors", colors); }
 
-  /** Rotations of the Gaussians' axes; null where all are isotropic. */
+  /** Sets the rotations of the Gaussians' axes; null where all are isotropic. */
   setRotations(rotations) {
     this.hasAxes = rotations !== null;
     if (this.hasAxes) this.write("rotations", rotations);
   }
 
-  /** Standard deviations along the axes, and opacities as the camera sees them. */
+  /** Sets the standard deviations along the axes, and the opacities for the camera. */
   setScales(scales) { this.write("scales", scales); }
 
-  /** Makes the steps of an image: kernel, bind group, and workgroups or the place in "work" where their number stands. */
+  /** Builds the steps of an image: kernel, bind group, and workgroups or the place in "work" that holds their number. */
   plan(width, height) {
     const { count, kernels, device } = this;
     const { tile, binsLanes, block, digitBits, keyBits, segments, pairsPerGaussian, pairsPerTile, minPairs } = this.numbers;
@@ -156,7 +156,7 @@ export class WebGpuDrawing {
       step("reduce", { 0: length, 1: values, 2: own.sums }, [segments, 1]);
       step("apply", { 0: length, 1: values, 2: own.sums, 3: total }, [segments, 1]);
     };
-    // Returns the buffer in which the sorted elements lie.
+    // Returns the buffer of the sorted elements.
     const sort = (name, elements, passes, isScaled, length, groups) => {
       const [table, extremes, valid] = ["Table", "Extremes", "Valid"].map(part => own[name + part]);
       let [from, to] = [own[`${name}Elements`], own[`${name}Other`]];
@@ -198,7 +198,7 @@ export class WebGpuDrawing {
     this.composed = device.createBindGroup({ layout: this.compose.getBindGroupLayout(0), entries });
   }
 
-  /** Constants of an image with a camera of 19 numbers (viewer/page/src/page.rs), for kernels that take any lens. */
+  /** Returns the constants of an image with a camera of 19 numbers (viewer/page/src/page.rs), for kernels that take any lens. */
   frameConstants(camera, width, height) {
     const { offsets, numbers } = this;
     const bytes = new ArrayBuffer(offsets.bytes);

@@ -1,12 +1,12 @@
-// The page: messages of the rig in, people on the canvas. page.wasm decodes and poses; draw_webgpu.js draws with the rig's kernels, or
-// draw_webgl2.js where there is no WebGPU, or only one that a processor computes.
+// Page: shows the rig's people on the canvas. page.wasm decodes and poses; draw_webgpu.js draws with the rig's kernels, or draw_webgl2.js
+// where there is no WebGPU, or only a software adapter.
 import { WebGl2Drawing } from "./draw_webgl2.js";
 import { WebGpuDrawing, openWebGpu } from "./draw_webgpu.js";
 
 const KIND = { rig: 0, state: 4, forget: 5 };
 const BACKGROUND = [27 / 255, 29 / 255, 32 / 255];
 const RETRY_MS = 1000;
-const SHOWN_OVER_MS = 2000; // rates are means over this time
+const SHOWN_OVER_MS = 2000; // time over which rates are averaged
 
 const parameters = new URLSearchParams(location.search);
 const canvas = document.getElementById("view");
@@ -15,7 +15,7 @@ const stateText = document.getElementById("state");
 const troubleText = document.getElementById("trouble");
 const text = new TextDecoder();
 
-// What the browser lacks, or a fault of the page, which cannot go on.
+// Missing feature of the browser, or fault of the page, which cannot continue.
 let fault = "";
 function fail(problem) { fault = troubleText.textContent = problem; }
 function explain(error, message) {
@@ -30,16 +30,16 @@ const wasm = instance.exports;
 const floats = (address, count) => new Float32Array(wasm.memory.buffer, address, count);
 const now = () => performance.now() / 1000;
 
-// "draw=webgl2" and "draw=webgpu" in the address choose. By itself, the page leaves a WebGPU that a processor computes alone.
+// "draw=webgl2" and "draw=webgpu" in the address choose the drawing. By default, the page does not use a software WebGPU adapter.
 const wantedDrawing = parameters.get("draw");
 let drawing = null; // none while the graphics processor is lost
-let uploaded = false; // whether it has the Gaussians
+let uploaded = false; // whether the drawing has the Gaussians
 
 async function openDrawing(hadWebGpu) {
   const opened = wantedDrawing === "webgl2" ? null
     : await openWebGpu(wantedDrawing === "webgpu").catch(error => console.warn(`WebGPU: ${error.message}`));
   if (!opened) {
-    // A canvas stays what it was first.
+    // A canvas keeps the type of its first context.
     if (hadWebGpu) throw new Error("The graphics processor was lost; load the page again.");
     if (wantedDrawing === "webgpu") throw new Error("This browser offers no WebGPU here; take draw=webgpu out of the address.");
     return new WebGl2Drawing(canvas);
@@ -58,11 +58,11 @@ drawing = await openDrawing(false);
 let state = { trouble: "Connecting", sets_per_second: 0, people: [], color_layers: [0, 0] };
 let linkTrouble = "";
 let interpolates = !parameters.has("lowest-latency");
-let scale = 1; // canvas pixels for a pixel of the screen
+let scale = 1; // canvas pixels per pixel of the screen
 let dirty = true;
 const recent = []; // [time ms, bytes] of messages
 const drawn = []; // times ms of images
-const spent = { decode: 0, pose: 0, draw: 0 }; // smoothed ms of a message, an image's posing and sorting, and its drawing
+const spent = { decode: 0, pose: 0, draw: 0 }; // smoothed run times, ms: decoding a message, posing and sorting an image, drawing it
 
 function timed(what, work) {
   const start = performance.now();
@@ -189,7 +189,7 @@ canvas.addEventListener("webglcontextrestored", () => { drawing = new WebGl2Draw
 
 let lastTick = performance.now();
 
-/** Fewer pixels where drawing takes long, more where there is time. */
+/** Reduces the resolution where drawing is slow, and raises it where there is time. */
 function adapt() {
   const late = drawn.length > 8 ? (drawn.at(-1) - drawn.at(-9)) / 8 : 0;
   if (late > 45 && scale > 0.35) scale *= 0.8;
@@ -220,7 +220,7 @@ function tick(time) {
   else order = wasm.order(width, height);
   spent.pose += 0.05 * (performance.now() - start - spent.pose);
   timed("draw", () => {
-    // The memory may have moved until here.
+    // The memory may have moved before this point.
     const list = address => floats(address, 4 * count);
     const rotations = wasm.rotations(); // 0 while all Gaussians are isotropic
     if (changes & 1) {
@@ -228,7 +228,7 @@ function tick(time) {
       drawing.setRotations(rotations ? list(rotations) : null, count);
     }
     if (changes & 2) drawing.setColors(list(wasm.colors()), count);
-    // Opacities depend on the camera; a drawing that takes the order does without them.
+    // Opacities depend on the camera; a drawing that takes the order does not need them.
     if (rotations && (changes & 1 || drawing.sorts)) drawing.setScales(list(wasm.scales()), count);
     const ordered = drawing.sorts ? null : new Uint32Array(wasm.memory.buffer, order, wasm.order_length());
     drawing.draw(floats(wasm.camera(), 19), BACKGROUND, ordered);
@@ -247,20 +247,20 @@ function showState(time) {
   const bits = recent.reduce((sum, [, bytes]) => sum + bytes, 0) * 8 / SHOWN_OVER_MS / 1000;
   const people = wasm.people();
   const shown = people & 255, complete = (people & 256) !== 0;
-  const missing = state.people.length > 0 ? "A person is on the way." : "The rig is up; nobody is seen now.";
-  const nobody = shown === 0 && !state.trouble ? missing : "";
+  const missing = state.people.length > 0 ? "Loading a person." : "The rig is running; no person is in view.";
+  const absence = shown === 0 && !state.trouble ? missing : "";
   const quality = state.people.filter(([, quality]) => quality !== null).map(([, quality]) => `${Math.round(100 * quality)} %`);
   const [layers, all] = state.color_layers;
-  troubleText.textContent = fault || linkTrouble || state.trouble || nobody;
+  troubleText.textContent = fault || linkTrouble || state.trouble || absence;
   stateText.textContent = parameters.has("bare") ? "" : [
     state.rig ?? "",
-    `${rate(drawn).toFixed(0)} images/s` + (state.sets_per_second > 0 ? `, rig ${state.sets_per_second.toFixed(1)} sets/s` : "")
+    `${rate(drawn).toFixed(0)} images/s` + (state.sets_per_second > 0 ? `, rig ${state.sets_per_second.toFixed(1)} frame sets/s` : "")
       + `, ${bits.toFixed(1)} Mbit/s`,
     `decode ${spent.decode.toFixed(1)} ms, pose and sort ${spent.pose.toFixed(1)} ms, ${drawing?.kind ?? "graphics lost"} ${spent.draw.toFixed(1)} ms`,
     quality.length > 0 ? `tracking ${quality.join(", ")}` : "",
-    // An avatar brings its colours.
-    shown > 0 && layers < all && wasm.scales() === 0 ? `colours: ${layers} of ${all} layers, as many as the line to the rig carries` : "",
-    shown > 0 && !complete ? "colours are still coming" : "",
+    // An avatar's colours are part of it.
+    shown > 0 && layers < all && wasm.scales() === 0 ? `colours: ${layers} of ${all} layers, as many as the network to the rig carries` : "",
+    shown > 0 && !complete ? "colours are still loading" : "",
   ].filter(line => line).join("\n");
   document.documentElement.dataset.ready = shown > 0 && complete && !troubleText.textContent ? "yes" : "no";
 }

@@ -1,4 +1,4 @@
-# attack_page.py PORT SECONDS RATE: asks the page's server of this computer (plain HTTP) RATE times a second over 64 connections that stay open,
+# attack_page.py PORT SECONDS RATE: asks the page's server of this computer (plain HTTP) RATE times per second over 64 connections that stay open,
 # without a token, and counts the answers. Measure beside it with `flyrig-bench receive`.
 import selectors,socket,sys,time
 port=int(sys.argv[1]);secs=float(sys.argv[2]);rate=float(sys.argv[3])
@@ -25,4 +25,4 @@ while time.time()-start<secs:
         if data: answered+=data.count(b'HTTP/1.1 ')
         else: leave(key.fileobj);closed+=1
 took=time.time()-start
-print('asked %.0f answered %.0f a second, %d connections closed'%(asked/took,answered/took,closed))
+print('asked %.0f answered %.0f per second, %d connections closed'%(asked/took,answered/took,closed))

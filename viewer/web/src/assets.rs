@@ -1,4 +1,4 @@
-//! Files of the page, in the program itself.
+//! Files of the page, embedded in the program.
 
 use std::sync::LazyLock;
 
@@ -6,7 +6,7 @@ use flyrig_renderer::BrowserKernels;
 use hyper::body::Bytes;
 use serde_json::{Map, Value, json};
 
-/// A file of the page.
+/// File of the page.
 pub(crate) struct Asset {
     pub path: &'static str,
     pub kind: &'static str,
@@ -15,7 +15,7 @@ pub(crate) struct Asset {
 
 const SCRIPT: &str = "text/javascript; charset=utf-8";
 
-/// All files.
+/// All files of the page.
 static ASSETS: LazyLock<[Asset; 6]> = LazyLock::new(|| {
     let file = |path, kind, bytes| Asset { path, kind, bytes: Bytes::from_static(bytes) };
     [
@@ -28,12 +28,12 @@ static ASSETS: LazyLock<[Asset; 6]> = LazyLock::new(|| {
     ]
 });
 
-/// Returns the file of a path.
+/// Returns the file at a path.
 pub(crate) fn asset(path: &str) -> Option<&'static Asset> {
     ASSETS.iter().find(|asset| asset.path == path)
 }
 
-/// Returns [`BrowserKernels`] as JSON, with an object of each list.
+/// Returns [`BrowserKernels`] as JSON, with an object for each list.
 fn kernels() -> String {
     let BrowserKernels { modules, numbers, frame } = BrowserKernels::new();
     let modules: Map<String, Value> = modules.map(|(name, wgsl)| (name.to_owned(), wgsl.into())).into_iter().collect();

@@ -8,22 +8,22 @@ use clap::{
 };
 use serde::{Deserialize, Serialize};
 
-use crate::WebError;
+use crate::error::WebError;
 
-/// Browsers that may be allowed at a time.
+/// Range of the largest number of browsers.
 const BROWSERS: std::ops::RangeInclusive<usize> = 1..=256;
 
-/// The web page for browsers.
+/// Settings of the web page for browsers.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize, Args)]
 #[serde(deny_unknown_fields, default)]
 pub struct WebConfig {
-    /// Address of the page; port 0 takes a free one.
+    /// Address of the page; port 0 takes a free port.
     #[arg(long, default_value = "127.0.0.1:8080", value_parser = checked_address)]
     pub listen: String,
-    /// Listen where other computers reach the page without encryption (HTTPS); who watches needs the link with its token all the same.
+    /// Listen where other computers reach the page without encryption (HTTPS); viewers need the link with its token all the same.
     #[arg(long)]
     pub insecure: bool,
-    /// Certificate of the page, PEM, in place of one for this run; it is made together with its key where both files are missing.
+    /// Certificate of the page, PEM, instead of one for this run; created together with its key where both files are missing.
     // The parser of paths refuses an empty default.
     #[arg(long, value_name = "FILE", default_value = "", hide_default_value = true,
         value_parser = OsStringValueParser::new().map(PathBuf::from))]
@@ -32,16 +32,16 @@ pub struct WebConfig {
     #[arg(long, value_name = "FILE", default_value = "", hide_default_value = true,
         value_parser = OsStringValueParser::new().map(PathBuf::from))]
     pub key: PathBuf,
-    /// Name by which browsers reach this computer, besides its addresses and localhost; may be repeated.
+    /// Name by which browsers reach this computer, besides its addresses and localhost; may be given repeatedly.
     #[arg(long = "name", value_name = "NAME")]
     pub names: Vec<String>,
-    /// Most browsers at a time.
+    /// Largest number of browsers at a time.
     #[arg(long, default_value_t = Self::default().max_browsers)]
     pub max_browsers: usize,
 }
 
 impl Default for WebConfig {
-    /// Listens nowhere.
+    /// Returns settings without an address, which serve no page.
     fn default() -> Self {
         Self {
             listen: String::new(),
@@ -55,10 +55,10 @@ impl Default for WebConfig {
 }
 
 impl WebConfig {
-    /// Checks every field; an empty address means that no page is wanted.
+    /// Checks every field; an empty address means no page.
     ///
     /// # Errors
-    /// [`WebError::Config`] with the field's name and what it may be.
+    /// [`WebError::Config`] names the field and its valid values.
     pub fn validate(&self) -> Result<(), WebError> {
         if !self.listen.is_empty() {
             self.address()?;

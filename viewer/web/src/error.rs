@@ -2,29 +2,29 @@
 
 use std::{net::SocketAddr, path::PathBuf};
 
-/// Why no page is served.
+/// Error of starting the server.
 #[derive(Debug, thiserror::Error)]
 pub enum WebError {
-    /// A setting is not valid.
+    /// Invalid setting.
     #[error("{0}")]
     Config(String),
-    /// A certificate or a key cannot be used.
+    /// Unusable certificate or key.
     #[error("{}: {problem}", file.display())]
     Certificate {
-        /// Which file.
+        /// Path of the file.
         file: PathBuf,
-        /// The fault and the fix.
+        /// Fault and fix.
         problem: String,
     },
-    /// The address cannot be listened on.
+    /// Address that cannot be listened on.
     #[error("web: cannot listen on {address}: {problem}; free the port or choose another one")]
     Listen {
-        /// The address.
+        /// Address of the page.
         address: SocketAddr,
         /// Error of the operating system.
         problem: std::io::Error,
     },
-    /// The system gives no thread, or no random numbers.
+    /// Failure of the system: no thread, or no random numbers.
     #[error("web: cannot start: {0}")]
     Start(String),
 }

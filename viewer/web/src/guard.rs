@@ -1,4 +1,4 @@
-//! Who may ask: names of this computer, pages of this server, holders of the link.
+//! Admission of requests: names of this computer, pages of this server, tokens of links.
 
 use std::net::IpAddr;
 
@@ -7,30 +7,30 @@ use hyper::{
     header::{HOST, HeaderValue, ORIGIN},
 };
 
-/// Bytes of a token.
+/// Length of a token, bytes.
 const TOKEN_BYTES: usize = 16;
 
-/// Secret of the page's link, after `#`.
+/// Secret of the page's link, behind `#`.
 #[derive(Debug, Clone)]
 pub(crate) struct Token(Option<String>);
 
 impl Token {
-    /// Anybody may watch.
+    /// Token of a page that is open to all.
     pub const NONE: Self = Self(None);
 
-    /// A new secret of 128 random bits.
+    /// Creates a secret of 128 random bits.
     pub fn random() -> Result<Self, getrandom::Error> {
         let mut bytes = [0u8; TOKEN_BYTES];
         getrandom::fill(&mut bytes)?;
         Ok(Self(Some(bytes.iter().map(|byte| format!("{byte:02x}")).collect())))
     }
 
-    /// The text of the link after its path.
+    /// Returns the fragment of the link.
     pub fn fragment(&self) -> String {
         self.0.as_ref().map_or_else(String::new, |token| format!("#{token}"))
     }
 
-    /// Compares in a time that does not depend on where the texts differ.
+    /// Compares a token in a time that does not depend on where it differs.
     pub fn admits(&self, given: &str) -> bool {
         let Some(token) = &self.0 else { return true };
         let differs = token.bytes().zip(given.bytes()).fold(0u8, |differs, (a, b)| differs | (a ^ b));
@@ -38,10 +38,10 @@ impl Token {
     }
 }
 
-/// Checks the names in a request's headers; the error is shown to the one who asked.
+/// Checks host and origin in the headers of a request; the error is shown to the client.
 ///
-/// A page of another site cannot read what this server answers, but it could open a WebSocket, or make a name of its own point to
-/// this address. So the host must be an address, `localhost` or a name that was given, and the origin must be that host with the server's own scheme.
+/// A page of another site cannot read the answers of this server, but it could open a WebSocket, or make a name of its own resolve to this
+/// address. So the host must be an address, `localhost` or a configured name, and the origin must be that host with the server's scheme.
 pub(crate) fn check_names(headers: &HeaderMap, scheme: &str, names: &[String]) -> Result<(), String> {
     let text = |value: &HeaderValue| value.to_str().map(str::to_owned).unwrap_or_default();
     let host = headers.get(HOST).map(text).unwrap_or_default();
@@ -61,7 +61,7 @@ pub(crate) fn check_names(headers: &HeaderMap, scheme: &str, names: &[String]) -
     }
 }
 
-/// The host without its port.
+/// Returns a host without its port.
 fn host_name(host: &str) -> &str {
     match host.rsplit_once(':') {
         Some((name, port)) if port.bytes().all(|byte| byte.is_ascii_digit()) => name,
@@ -69,7 +69,7 @@ fn host_name(host: &str) -> &str {
     }
 }
 
-/// A short text without control characters.
+/// Returns the beginning of a text, without control characters.
 fn printable(text: &str) -> String {
     text.chars().filter(|c| !c.is_control()).take(80).collect()
 }

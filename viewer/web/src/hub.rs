@@ -1,4 +1,4 @@
-//! Fan-out of messages to browsers: the newest of each kind, and a bounded queue for each browser.
+//! Fan-out of messages to browsers: the newest of each kind, and a bounded queue per browser.
 
 use std::{
     collections::{BTreeMap, VecDeque},
@@ -10,12 +10,12 @@ use flyrig_types::lock;
 use bytes::{BufMut as _, Bytes, BytesMut};
 use tokio::sync::Notify;
 
-/// Bytes of colours that may wait for a browser; beyond them the oldest are left out, and come again within a second.
+/// Largest number of waiting bytes of colours per browser; beyond it the oldest are dropped, and refreshed within a second.
 const COLOR_BYTES: usize = 256 << 10;
-/// People whose messages are kept.
+/// Largest number of people whose messages are kept.
 const MAX_PEOPLE: usize = 32;
 
-/// Kind of a message: its first byte.
+/// Kind of a message, its first byte.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 #[repr(u8)]
 pub(crate) enum Kind {
@@ -25,15 +25,15 @@ pub(crate) enum Kind {
     Template = 1,
     /// Motion of a person.
     Motion = 2,
-    /// A layer of a person's colours.
+    /// Layer of a person's colours.
     Colors = 3,
-    /// State in words and numbers, JSON.
+    /// Status of the rig, JSON.
     State = 4,
-    /// The rig began anew: everybody is to be forgotten.
+    /// The rig restarted: the browser forgets all people.
     Forget = 5,
 }
 
-/// Puts a message together.
+/// Assembles a message.
 fn message(kind: Kind, person: u32, payload: &[u8]) -> Bytes {
     let mut bytes = BytesMut::with_capacity(8 + payload.len());
     bytes.put_slice(&[kind as u8, 0, 0, 0]);
@@ -42,14 +42,14 @@ fn message(kind: Kind, person: u32, payload: &[u8]) -> Bytes {
     bytes.freeze()
 }
 
-/// The last messages, and all browsers.
+/// Last messages, and all browsers.
 #[derive(Debug, Default)]
 pub(crate) struct Hub(Mutex<Inner>);
 
 #[derive(Debug, Default)]
 struct Inner {
     rig: Option<Bytes>,
-    /// By person, with its hash.
+    /// Hash and message of each person's template.
     templates: BTreeMap<u32, (u64, Bytes)>,
     motions: BTreeMap<u32, Bytes>,
     state: Option<Bytes>,
@@ -57,7 +57,7 @@ struct Inner {
     next: u64,
 }
 
-/// Messages that one browser has not been sent yet.
+/// Messages that one browser has yet to receive.
 #[derive(Debug, Default)]
 struct Browser {
     wake: Arc<Notify>,
@@ -71,7 +71,7 @@ struct Browser {
 }
 
 impl Browser {
-    /// Takes the next message: what others depend on first, motion before colours.
+    /// Takes the next message: those that others depend on first, motion before colours.
     fn take(&mut self) -> Option<Bytes> {
         let first = |map: &mut BTreeMap<u32, Bytes>| map.pop_first().map(|(_, bytes)| bytes);
         let next = self.forget.take().or_else(|| self.rig.take()).or_else(|| first(&mut self.templates));
@@ -96,13 +96,13 @@ impl Hub {
         lock(&self.0)
     }
 
-    /// Number of browsers.
+    /// Returns the number of browsers.
     pub fn browsers(&self) -> usize {
         self.lock().browsers.len()
     }
 
-    /// Adds a browser, unless there are so many already; it first gets what is known now.
-    pub fn join(self: &Arc<Self>, most: usize) -> Option<Place> {
+    /// Adds a browser, which first receives the last messages; `None` when there are `most` browsers already.
+    pub fn join(self: &Arc<Self>, most: usize) -> Option<BrowserPlace> {
         let mut inner = self.lock();
         if inner.browsers.len() >= most {
             return None;
@@ -120,9 +120,10 @@ impl Hub {
         };
         wake.notify_one();
         inner.browsers.insert(number, browser);
-        Some(Place { hub: Arc::clone(self), number, wake })
+        Some(BrowserPlace { hub: Arc::clone(self), number, wake })
     }
 
+    /// Puts a message into the queues of all browsers.
     fn to_all(inner: &mut Inner, put: impl Fn(&mut Browser)) {
         for browser in inner.browsers.values_mut() {
             put(browser);
@@ -140,12 +141,12 @@ impl Hub {
         }
     }
 
-    /// Whether this is a person's template.
+    /// Returns whether this is the template of a person.
     pub fn has_template(&self, person: u32, hash: u64) -> bool {
         self.lock().templates.get(&person).is_some_and(|(known, _)| *known == hash)
     }
 
-    /// Sends a person's template. Beyond the most people kept, nobody new comes in.
+    /// Sends the template of a person; new people beyond [`MAX_PEOPLE`] are ignored.
     pub fn template(&self, person: u32, hash: u64, payload: &[u8]) {
         let bytes = message(Kind::Template, person, payload);
         let mut inner = self.lock();
@@ -156,7 +157,7 @@ impl Hub {
         }
     }
 
-    /// Sends a person's motion in place of any that waits.
+    /// Sends the motion of a person, which replaces a waiting one.
     pub fn motion(&self, person: u32, payload: &[u8]) {
         let bytes = message(Kind::Motion, person, payload);
         let mut inner = self.lock();
@@ -172,7 +173,7 @@ impl Hub {
         Self::to_all(&mut self.lock(), |browser| browser.push_colors(bytes.clone()));
     }
 
-    /// Sends the state.
+    /// Sends the status of the rig.
     pub fn state(&self, json: &[u8]) {
         let bytes = message(Kind::State, 0, json);
         let mut inner = self.lock();
@@ -182,7 +183,7 @@ impl Hub {
         }
     }
 
-    /// Forgets everybody: the rig began anew.
+    /// Forgets all people, because the rig restarted.
     pub fn forget_people(&self) {
         let bytes = message(Kind::Forget, 0, &[]);
         let mut inner = self.lock();
@@ -195,15 +196,15 @@ impl Hub {
     }
 }
 
-/// A browser's place among the others, until it is dropped.
+/// Place of a browser, which is removed when it is dropped.
 #[derive(Debug)]
-pub(crate) struct Place {
+pub(crate) struct BrowserPlace {
     hub: Arc<Hub>,
     number: u64,
     wake: Arc<Notify>,
 }
 
-impl Place {
+impl BrowserPlace {
     /// Waits for the next message of this browser.
     pub async fn next(&self) -> Bytes {
         loop {
@@ -215,7 +216,7 @@ impl Place {
     }
 }
 
-impl Drop for Place {
+impl Drop for BrowserPlace {
     fn drop(&mut self) {
         self.hub.lock().browsers.remove(&self.number);
     }
@@ -226,8 +227,8 @@ impl Drop for Place {
 mod tests {
     use super::*;
 
-    /// All that waits for a browser.
-    fn drain(place: &Place) -> Vec<(u8, u32, Vec<u8>)> {
+    /// Takes all messages that wait for a browser.
+    fn drain(place: &BrowserPlace) -> Vec<(u8, u32, Vec<u8>)> {
         let mut inner = place.hub.lock();
         let browser = inner.browsers.get_mut(&place.number).unwrap();
         let part = |bytes: Bytes| (bytes[0], u32::from_le_bytes(bytes[4..8].try_into().unwrap()), bytes[8..].to_vec());
@@ -262,7 +263,7 @@ mod tests {
         assert_eq!(drain(&place), expected);
         assert!(drain(&place).is_empty());
         drop(place);
-        // Who comes later starts with all that does not come again.
+        // A later browser starts with the messages that are not repeated.
         let late = hub.join(1).unwrap();
         assert_eq!(drain(&late), expected[..4]);
         hub.motion(3, b"m4");

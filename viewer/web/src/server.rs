@@ -1,4 +1,4 @@
-//! The HTTP server.
+//! HTTP server of the page.
 
 use std::{
     convert::Infallible,
@@ -7,10 +7,10 @@ use std::{
         Arc,
         atomic::{AtomicBool, Ordering},
     },
-    thread::{Builder, JoinHandle},
     time::Duration,
 };
 
+use flyrig_access::{Bounds, Connection, Listener, Serve};
 use flyrig_transport::TransportConfig;
 use flyrig_types::{SupervisedThread, ThreadHealth};
 use http_body_util::Full;
@@ -24,17 +24,16 @@ use hyper::{
 use hyper_util::rt::{TokioIo, TokioTimer};
 use tokio::{
     io::{AsyncRead, AsyncWrite},
-    net::{TcpListener, TcpSocket, TcpStream},
-    runtime,
-    sync::{Semaphore, oneshot},
-    time::{sleep, timeout},
+    net::TcpStream,
+    time::timeout,
 };
 use tokio_rustls::TlsAcceptor;
 use tokio_tungstenite::tungstenite::handshake::derive_accept_key;
 
 use crate::{
-    WebConfig, WebError,
     assets::asset,
+    config::WebConfig,
+    error::WebError,
     guard::{Token, check_names},
     hub::Hub,
     socket,
@@ -42,21 +41,15 @@ use crate::{
     upstream,
 };
 
-/// Time that a client has to ask.
+/// Time limit of a handshake, and of the headers of a request.
 const PATIENCE: Duration = Duration::from_secs(2);
 /// First byte of a TLS connection.
 const TLS_HANDSHAKE: u8 = 22;
-/// Longest request that is read, the smallest bound that hyper takes.
+/// Largest request, bytes; the smallest bound that hyper takes.
 const REQUEST_BYTES: usize = 8192;
-/// Connections at the same time; the others wait in the system's queue.
+/// Largest number of connections at a time; further ones wait in the system's queue.
 const CONNECTIONS: usize = 512;
-/// Pause after a connection could not be accepted: with no file descriptor left, trying at once only costs time.
-const PAUSE: Duration = Duration::from_millis(100);
-/// Bytes that the system keeps for a connection, sent or not: enough for 20 Mbit/s with 200 ms. Linux doubles it.
-const SEND_BUFFER: u32 = 256 << 10;
-/// Bytes of them that are not sent yet: what lies there cannot be overtaken by newer motion.
-const UNSENT: u32 = 4 << 10;
-/// Headers of every answer: nothing from elsewhere, and no frame of another page around it.
+/// Headers of every answer: the page loads nothing from elsewhere, and no other page frames it.
 const HEADERS: [(&str, &str); 5] = [
     (
         "content-security-policy",
@@ -70,11 +63,11 @@ const HEADERS: [(&str, &str); 5] = [
     ("cache-control", "no-cache"),
 ];
 
-/// Serves the page until it is dropped.
+/// Server of the page until it is dropped.
 #[derive(Debug)]
 pub struct WebServer {
-    address: SocketAddr,
-    /// Name of this computer.
+    listener: Listener,
+    /// First configured name of this computer.
     name: Option<String>,
     token: Token,
     /// SHA-256 of the certificate; `None` without HTTPS.
@@ -82,9 +75,6 @@ pub struct WebServer {
     hub: Arc<Hub>,
     upstream: SupervisedThread,
     ended: Arc<AtomicBool>,
-    /// Dropping it ends the server's thread.
-    stop: Option<oneshot::Sender<()>>,
-    thread: Option<JoinHandle<()>>,
 }
 
 /// State shared by all connections.
@@ -97,10 +87,10 @@ struct Shared {
 }
 
 impl WebServer {
-    /// Starts to listen. The rig may come later; it is subscribed to while browsers watch.
+    /// Starts to listen. The rig may start later; it is subscribed to while browsers watch.
     ///
     /// # Errors
-    /// [`WebError`]: settings that are not valid, a certificate that cannot be used, or an address that is taken.
+    /// [`WebError`] for invalid settings, an unusable certificate, or an address that is taken.
     pub fn start(config: &WebConfig, transport: TransportConfig) -> Result<Self, WebError> {
         config.validate()?;
         let wanted = config.address()?;
@@ -112,16 +102,13 @@ impl WebServer {
         let start = |problem: String| WebError::Start(problem);
         let token =
             if is_loopback { Token::NONE } else { Token::random().map_err(|error| start(error.to_string()))? };
-        let runtime = runtime::Builder::new_current_thread().enable_io().enable_time().build();
-        let runtime = runtime.map_err(|error| start(error.to_string()))?;
-        let listener = {
-            let _inside = runtime.enter();
-            listen(wanted).map_err(|problem| WebError::Listen { address: wanted, problem })?
-        };
-        let address = listener.local_addr().map_err(|error| start(error.to_string()))?;
+        let bounds = Bounds { connections: CONNECTIONS, per_address: false, is_streaming: true };
+        let listener =
+            Listener::bind(wanted, bounds).map_err(|problem| WebError::Listen { address: wanted, problem })?;
+        let address = listener.address();
         if !is_loopback && tls.is_none() {
             tracing::warn!(
-                "the web page at {address} is not encrypted: whoever can read this network can watch. Who watches needs the whole link"
+                "the web page at {address} is not encrypted: any computer that can read this network can watch. Viewers need the whole link"
             );
         }
         let hub = Arc::<Hub>::default();
@@ -129,65 +116,44 @@ impl WebServer {
         let most = config.max_browsers;
         let (tls, fingerprint) = tls.map(|Tls { acceptor, fingerprint }| (acceptor, fingerprint)).unzip();
         let shared = Arc::new(Shared { hub: Arc::clone(&hub), token: token.clone(), tls, names, max_browsers: most });
-        let (stop, stopped) = oneshot::channel::<()>();
-        let work = move || {
-            runtime.block_on(async {
-                tokio::select! {
-                    () = accept(&listener, &shared) => {}
-                    _ = stopped => {}
-                }
-            });
-            // Messages under way are dropped with the tasks.
-            runtime.shutdown_timeout(PAUSE);
-        };
-        let thread = Builder::new().name("web".to_owned()).spawn(work).map_err(|error| start(error.to_string()))?;
+        let listener = listener.start("web", shared).map_err(|error| start(error.to_string()))?;
         let ended = Arc::new(AtomicBool::new(false));
         let (fed, until) = (Arc::clone(&hub), Arc::clone(&ended));
         let upstream = SupervisedThread::start("web upstream", move || upstream::run(&transport, &fed, &until));
         let upstream = upstream.map_err(|error| start(error.to_string()))?;
-        Ok(Self {
-            address,
-            name: config.names.first().cloned(),
-            token,
-            fingerprint,
-            hub,
-            upstream,
-            ended,
-            stop: Some(stop),
-            thread: Some(thread),
-        })
+        Ok(Self { listener, name: config.names.first().cloned(), token, fingerprint, hub, upstream, ended })
     }
 
-    /// Address that is listened on.
+    /// Returns the address that is listened on.
     #[must_use]
     pub fn address(&self) -> SocketAddr {
-        self.address
+        self.listener.address()
     }
 
-    /// Link to the page, with the token where one is needed: at the first of this computer's names that were given, or at its address.
+    /// Returns the link to the page, with its token where one is needed, at the first configured name of this computer or at its address.
     #[must_use]
     pub fn link(&self) -> String {
         let scheme = if self.fingerprint.is_some() { "https" } else { "http" };
         let host = match &self.name {
-            Some(name) if self.address.ip().is_unspecified() => format!("{name}:{}", self.address.port()),
-            _ => reached_at(self.address).to_string(),
+            Some(name) if self.address().ip().is_unspecified() => format!("{name}:{}", self.address().port()),
+            _ => reached_at(self.address()).to_string(),
         };
         format!("{scheme}://{host}/{}", self.token.fragment())
     }
 
-    /// SHA-256 of the server's certificate, as browsers write it; `None` without HTTPS.
+    /// Returns the SHA-256 of the server's certificate, as browsers write it; `None` without HTTPS.
     #[must_use]
     pub fn fingerprint(&self) -> Option<&str> {
         self.fingerprint.as_deref()
     }
 
-    /// Number of browsers that watch.
+    /// Returns the number of browsers that watch.
     #[must_use]
     pub fn browsers(&self) -> usize {
         self.hub.browsers()
     }
 
-    /// Health of the thread that receives from the rig.
+    /// Returns the health of the thread that receives from the rig.
     #[must_use]
     pub fn thread(&self) -> ThreadHealth {
         self.upstream.health()
@@ -197,15 +163,11 @@ impl WebServer {
 impl Drop for WebServer {
     fn drop(&mut self) {
         self.ended.store(true, Ordering::Relaxed);
-        drop(self.stop.take());
-        if let Some(thread) = self.thread.take() {
-            let _ = thread.join();
-        }
         self.upstream.join();
     }
 }
 
-/// The address itself, or of one that means all: that under which this computer reaches others. Nothing is sent to find it.
+/// Returns an address, or for one that means all interfaces, that by which this computer reaches others; nothing is sent to find it.
 fn reached_at(address: SocketAddr) -> SocketAddr {
     if !address.ip().is_unspecified() {
         return address;
@@ -221,7 +183,7 @@ fn reached_at(address: SocketAddr) -> SocketAddr {
     SocketAddr::new(own.unwrap_or(loopback), address.port())
 }
 
-/// Addresses of this computer's interfaces that are up. A network without a way to others has no route that would name one.
+/// Returns the addresses of this computer's interfaces that are up: a network without a gateway has no route that names one.
 fn interfaces() -> Vec<IpAddr> {
     #[cfg(unix)]
     let of_all = pnet_datalink::interfaces()
@@ -235,7 +197,7 @@ fn interfaces() -> Vec<IpAddr> {
     of_all
 }
 
-/// The first address that other computers may reach; one that is valid on a single link needs the link's name, which browsers do not take.
+/// Returns the first address that other computers may reach. Link-local addresses need the name of the link, which browsers do not accept.
 fn reachable(is_ipv4: bool, addresses: Vec<IpAddr>) -> Option<IpAddr> {
     addresses.into_iter().find(|address| match address {
         IpAddr::V4(v4) => is_ipv4 && !v4.is_loopback(),
@@ -243,38 +205,16 @@ fn reachable(is_ipv4: bool, addresses: Vec<IpAddr>) -> Option<IpAddr> {
     })
 }
 
-/// Must be called inside of the runtime.
-fn listen(address: SocketAddr) -> std::io::Result<TcpListener> {
-    let socket = if address.is_ipv4() { TcpSocket::new_v4() } else { TcpSocket::new_v6() }?;
-    socket.set_reuseaddr(cfg!(unix))?;
-    // Connections inherit it.
-    socket.set_send_buffer_size(SEND_BUFFER)?;
-    socket.bind(address)?;
-    socket.listen(1024)
-}
-
-async fn accept(listener: &TcpListener, shared: &Arc<Shared>) {
-    let places = Arc::new(Semaphore::new(CONNECTIONS));
-    while let Ok(place) = Arc::clone(&places).acquire_owned().await {
-        match listener.accept().await {
-            Ok((client, _)) => {
-                let shared = Arc::clone(shared);
-                tokio::spawn(async move {
-                    let _place = place;
-                    // A client that asks badly is its own loss.
-                    let _ = greet(client, shared).await;
-                });
-            }
-            Err(_) => sleep(PAUSE).await,
-        }
+impl Serve for Shared {
+    async fn serve(self: Arc<Self>, connection: Connection) {
+        let Connection { stream, place: _place, .. } = connection;
+        // A malformed request costs its client alone.
+        let _ = greet(stream, self).await;
     }
 }
 
-/// Begins TLS where it is spoken.
+/// Serves a client, through TLS where there is a certificate.
 async fn greet(client: TcpStream, shared: Arc<Shared>) -> hyper::Result<()> {
-    let _ = client.set_nodelay(true);
-    #[cfg(target_os = "linux")]
-    let _ = socket2::SockRef::from(&client).set_tcp_notsent_lowat(UNSENT);
     let Some(tls) = shared.tls.clone() else { return answer(client, shared).await };
     let mut first = [0];
     match timeout(PATIENCE, client.peek(&mut first)).await {
@@ -288,7 +228,7 @@ async fn greet(client: TcpStream, shared: Arc<Shared>) -> hyper::Result<()> {
     }
 }
 
-/// Answers a browser that was sent to `http://`.
+/// Answers a browser that speaks HTTP where HTTPS is expected.
 async fn refuse_http(client: TcpStream) -> hyper::Result<()> {
     let text = "this server speaks HTTPS: write https:// before its address\n";
     let service = service_fn(async |_: Request<Incoming>| {
@@ -328,7 +268,7 @@ fn respond(mut request: Request<Incoming>, shared: &Arc<Shared>) -> Response<Ful
     let text =
         |status, text: &'static str| page(status, "text/plain; charset=utf-8", Bytes::from_static(text.as_bytes()));
     if request.method() != Method::GET && request.method() != Method::HEAD {
-        return text(StatusCode::METHOD_NOT_ALLOWED, "only GET is answered\n");
+        return text(StatusCode::METHOD_NOT_ALLOWED, "only GET is supported\n");
     }
     if request.uri().path() == "/stream" {
         let is_upgrade =
@@ -367,7 +307,7 @@ fn page(status: StatusCode, kind: &'static str, body: Bytes) -> Response<Full<By
     *response.status_mut() = status;
     let headers = response.headers_mut();
     headers.insert(CONTENT_TYPE, HeaderValue::from_static(kind));
-    // A place is for the next one.
+    // The connection makes room for the next one.
     headers.insert(CONNECTION, HeaderValue::from_static("close"));
     for (name, value) in HEADERS {
         headers.insert(HeaderName::from_static(name), HeaderValue::from_static(value));

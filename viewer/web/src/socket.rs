@@ -1,4 +1,4 @@
-//! One browser's WebSocket.
+//! WebSocket of one browser.
 
 use std::{sync::Arc, time::Duration};
 
@@ -16,11 +16,11 @@ use tokio_tungstenite::{
 
 use crate::{guard::Token, hub::Hub};
 
-/// Time in which a browser shows the token of its link.
+/// Time limit of the token of a browser's link.
 const TOKEN_PATIENCE: Duration = Duration::from_secs(5);
-/// Time in which a message must leave; a browser that is slower is let go.
+/// Time limit of sending a message; a slower browser is disconnected.
 const SEND_PATIENCE: Duration = Duration::from_secs(20);
-/// Longest message of a browser, bytes.
+/// Largest message of a browser, bytes.
 const LONGEST: usize = 1024;
 
 /// Serves a browser until it leaves.
@@ -33,11 +33,11 @@ pub(crate) async fn serve(upgraded: Upgraded, hub: &Arc<Hub>, token: &Token, mos
     let mut socket = WebSocketStream::from_raw_socket(TokioIo::new(upgraded), Role::Server, Some(config)).await;
     let Some((code, reason)) = talk(&mut socket, hub, token, most).await else { return };
     let close = CloseFrame { code, reason: reason.into() };
-    // One that does not listen is closed all the same.
+    // A browser that does not respond is closed all the same.
     let _ = timeout(TOKEN_PATIENCE, socket.close(Some(close))).await;
 }
 
-/// Returns why the browser is let go; `None` when it left by itself.
+/// Serves a browser; returns why it is disconnected, or `None` when it left by itself.
 async fn talk(
     socket: &mut WebSocketStream<TokioIo<Upgraded>>,
     hub: &Arc<Hub>,
@@ -60,12 +60,12 @@ async fn talk(
             received = socket.next() => match received {
                 Some(Ok(Message::Ping(_) | Message::Pong(_))) => {}
                 Some(Ok(Message::Close(_)) | Err(_)) | None => return None,
-                Some(Ok(_)) => return Some((CloseCode::Policy, "a browser has nothing to say here")),
+                Some(Ok(_)) => return Some((CloseCode::Policy, "the page sent an unexpected message")),
             },
             bytes = place.next() => match timeout(SEND_PATIENCE, socket.send(Message::Binary(bytes))).await {
                 Ok(Ok(())) => {}
                 Ok(Err(_)) => return None,
-                Err(_) => return Some((CloseCode::Policy, "the line is too slow")),
+                Err(_) => return Some((CloseCode::Policy, "the network is too slow")),
             },
         }
     }

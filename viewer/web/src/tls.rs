@@ -1,4 +1,4 @@
-//! HTTPS: the certificate of the page's server.
+//! HTTPS: certificate of the page's server.
 
 use std::{
     io::Write as _,
@@ -11,14 +11,14 @@ use rcgen::{CertificateParams, KeyPair, date_time_ymd};
 use rustls_pki_types::{CertificateDer, PrivateKeyDer, pem::PemObject as _};
 use tokio_rustls::{TlsAcceptor, rustls};
 
-use crate::{WebConfig, WebError};
+use crate::{config::WebConfig, error::WebError};
 
-/// Largest file that is read as a certificate or key, bytes.
+/// Largest certificate or key file, bytes.
 const MOST_BYTES: u64 = 1 << 20;
-/// First and last year of a certificate of our own: nobody renews it.
+/// First and last year of a self-signed certificate, which is never renewed.
 const YEARS: (i32, i32) = (2020, 2045);
 
-/// The server's side of TLS, and the fingerprint that browsers show of its certificate.
+/// TLS acceptor, and the fingerprint that browsers show of its certificate.
 pub(crate) struct Tls {
     pub acceptor: TlsAcceptor,
     /// SHA-256 of the certificate, as browsers write it.
@@ -26,8 +26,8 @@ pub(crate) struct Tls {
 }
 
 impl Tls {
-    /// Reads certificate and key, or makes a certificate that signs itself: in the files that the settings name, so that browsers need
-    /// to accept it only once, or for this run.
+    /// Reads certificate and key, or creates a self-signed certificate: in the files that the settings name, so that browsers need to accept
+    /// it only once, or for this run.
     ///
     /// # Errors
     /// [`WebError::Certificate`] names the file and the fix.
@@ -82,7 +82,7 @@ impl Tls {
     }
 }
 
-/// A certificate for this computer's names and its key, PEM.
+/// Creates a certificate for this computer's names, and its key, PEM.
 fn self_signed(config: &WebConfig, address: SocketAddr) -> Result<(String, String), WebError> {
     let failed = |error: rcgen::Error| WebError::Start(format!("no certificate can be made ({error})"));
     let own = [IpAddr::from([127, 0, 0, 1]), address.ip()].map(|ip| ip.to_string());
@@ -109,7 +109,7 @@ fn read(file: &Path) -> Result<String, WebError> {
     std::fs::read_to_string(file).map_err(of)
 }
 
-/// Writes a file that must not be there; a secret one is for its owner alone.
+/// Writes a new file; a secret one is for its owner alone.
 fn write_new(file: &Path, text: &str, is_secret: bool) -> Result<(), WebError> {
     let mut options = std::fs::OpenOptions::new();
     options.write(true).create_new(true);

@@ -1,4 +1,4 @@
-//! The one subscription to the rig, while somebody watches.
+//! The one subscription to the rig, while browsers watch.
 
 use std::{
     sync::{
@@ -16,25 +16,26 @@ use serde::Serialize;
 
 use crate::hub::Hub;
 
-/// How long a message is waited for.
+/// Time limit of waiting for a message.
 const PATIENCE: Duration = Duration::from_millis(50);
-/// How often statistics and calibration are looked at.
-const LOOK_EVERY: Duration = Duration::from_millis(250);
+/// Interval between checks of statistics and calibration.
+const CHECK_EVERY: Duration = Duration::from_millis(250);
 /// Pause after a session that could not be opened.
 const SESSION_RETRY: Duration = Duration::from_millis(500);
-/// How long the subscription outlives the last browser: a page that is loaded again finds it.
+/// Time that the subscription outlives the last browser, so that a page that is loaded again finds it.
 const LINGER: Duration = Duration::from_secs(5);
 
-/// State of the rig, for the page.
+/// Status of the rig for the page.
 #[derive(Debug, Serialize)]
 struct State<'a> {
     rig: &'a str,
-    /// Reason in words why nobody can be shown; `None` without one.
+    /// Why no people can be shown; `None` without a problem.
     trouble: Option<String>,
+    /// Frame sets per second of the rig.
     sets_per_second: f64,
-    /// Quality of tracking of each person, 0..=1.
+    /// Number and tracking quality, 0..=1, of each person.
     people: Vec<(u32, Option<f64>)>,
-    /// Layers of colours that the rig's line carries, and all that there are.
+    /// Number of subscribed colour layers, and of all layers.
     color_layers: (usize, usize),
 }
 
@@ -57,7 +58,7 @@ pub(crate) fn run(config: &TransportConfig, hub: &Arc<Hub>, stop: &AtomicBool) {
             None => match Link::open(config) {
                 Ok(opened) => link = Some(opened),
                 Err(error) => {
-                    tell(hub, &config.rig, Some(error.to_string()), None, LAYERS);
+                    send_state(hub, &config.rig, Some(error.to_string()), None, LAYERS);
                     std::thread::sleep(SESSION_RETRY);
                 }
             },
@@ -65,10 +66,12 @@ pub(crate) fn run(config: &TransportConfig, hub: &Arc<Hub>, stop: &AtomicBool) {
     }
 }
 
+/// Subscription to the rig.
 struct Link {
     subscriber: Subscriber,
     templates: TemplateFetcher,
-    looked: Option<Instant>,
+    /// Time of the last check of statistics and calibration.
+    checked: Option<Instant>,
     stats: Option<RigStats>,
     was_up: bool,
 }
@@ -77,13 +80,13 @@ impl Link {
     fn open(config: &TransportConfig) -> Result<Self, TransportError> {
         let subscriber = Subscriber::open(config, &Interests { people: true, stats: true, ..Interests::default() })?;
         let templates = subscriber.template_fetcher()?;
-        Ok(Self { subscriber, templates, looked: None, stats: None, was_up: false })
+        Ok(Self { subscriber, templates, checked: None, stats: None, was_up: false })
     }
 
     fn turn(&mut self, config: &TransportConfig, hub: &Hub) {
-        if self.looked.is_none_or(|at| at.elapsed() >= LOOK_EVERY) {
-            self.looked = Some(Instant::now());
-            self.look(config, hub);
+        if self.checked.is_none_or(|at| at.elapsed() >= CHECK_EVERY) {
+            self.checked = Some(Instant::now());
+            self.report(config, hub);
         }
         match self.templates.take() {
             Ok(Some(FetchedTemplate { people, hash, bytes })) => {
@@ -93,16 +96,17 @@ impl Link {
             Err(error) => tracing::debug!("{error}"),
         }
         match self.subscriber.next_person(PATIENCE) {
-            Ok(Some(received)) => self.take(&received.body, hub),
+            Ok(Some(received)) => self.pass_on(&received.body, hub),
             Ok(None) => {}
             Err(error) => tracing::debug!("{error}"),
         }
     }
 
-    fn take(&mut self, message: &PersonMessage, hub: &Hub) {
+    /// Passes a message on, or requests its template.
+    fn pass_on(&mut self, message: &PersonMessage, hub: &Hub) {
         let Ok(stamp) = stamp_of(&message.bytes) else { return };
         if !hub.has_template(message.person, stamp.template) {
-            // Motion and colours of a template that is not there yet come again.
+            // Motion and colours of a template that has not arrived yet are repeated.
             return self.templates.ask(message.person, stamp.template);
         }
         match message.layer {
@@ -111,8 +115,8 @@ impl Link {
         }
     }
 
-    /// Passes on calibration, statistics and the state in words.
-    fn look(&mut self, config: &TransportConfig, hub: &Hub) {
+    /// Passes on calibration and the status of the rig.
+    fn report(&mut self, config: &TransportConfig, hub: &Hub) {
         if let Ok(Some(stats)) = self.subscriber.next_stats(Duration::ZERO) {
             self.stats = Some(stats.body);
         }
@@ -133,11 +137,12 @@ impl Link {
             (true, None) => Some("Waiting for the rig's calibration".to_owned()),
             (true, Some(_)) => None,
         };
-        tell(hub, &config.rig, trouble, self.stats.as_ref(), self.subscriber.color_layers());
+        send_state(hub, &config.rig, trouble, self.stats.as_ref(), self.subscriber.color_layers());
     }
 }
 
-fn tell(hub: &Hub, rig: &str, trouble: Option<String>, stats: Option<&RigStats>, layers: usize) {
+/// Sends the status of the rig to the browsers.
+fn send_state(hub: &Hub, rig: &str, trouble: Option<String>, stats: Option<&RigStats>, layers: usize) {
     let people = stats.map(|stats| stats.subjects.iter().map(|of| (of.person, of.quality)).collect());
     let sets_per_second = stats.map_or(0.0, |stats| stats.frames_per_second);
     let state =

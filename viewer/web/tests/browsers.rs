@@ -12,7 +12,7 @@ use std::{
     time::{Duration, Instant},
 };
 
-use flyrig_page::{MessageKind, Page};
+use flyrig_page::{Page, PageMessageKind};
 use flyrig_stream::{
     ColorEncoder, ColorSettings, EncodedTemplate, Motion, MotionEncoder, Stamp, StreamJoint, TemplateSource,
 };
@@ -142,7 +142,7 @@ fn watch(socket: &mut Socket, page: &mut Page, what: &str, mut done: impl FnMut(
             4 => state = String::from_utf8(payload).unwrap(),
             5 => page.forget_people(),
             kind => page
-                .take(MessageKind::of(kind.into()).unwrap(), person, &payload, started.elapsed().as_secs_f64())
+                .ingest(PageMessageKind::of(kind.into()).unwrap(), person, &payload, started.elapsed().as_secs_f64())
                 .unwrap(),
         }
         page.pose(started.elapsed().as_secs_f64(), false);
@@ -188,7 +188,7 @@ fn browsers_see_a_rig_that_comes_late_goes_and_comes_again_as_another() {
 }
 
 #[test]
-fn a_browser_that_stops_reading_holds_nobody_up() {
+fn a_browser_that_stops_reading_delays_no_other() {
     let rig = TestRig::start("tcp/127.0.0.1:0", 0.5);
     let server = server(&rig.endpoint, "127.0.0.1:0", false);
     let _stopped = [browser(server.address(), ""), browser(server.address(), "")];
@@ -204,7 +204,7 @@ fn a_browser_that_stops_reading_holds_nobody_up() {
     let closed = loop {
         match fourth.read().unwrap() {
             Message::Close(frame) => break frame.unwrap(),
-            message => assert!(!message.is_binary(), "somebody beyond the most is served"),
+            message => assert!(!message.is_binary(), "a browser beyond the limit is served"),
         }
     };
     assert!(closed.reason.contains("all places are taken"), "{closed}");
@@ -259,7 +259,7 @@ fn strangers_are_refused_in_words() {
             break frame.unwrap().reason.to_string();
         }
     };
-    assert!(reason.contains("nothing to say"), "{reason}");
+    assert!(reason.contains("unexpected message"), "{reason}");
 }
 
 #[test]
@@ -312,7 +312,7 @@ fn other_computers_are_served_through_https() {
     let token = link.split_once('#').unwrap().1.to_owned();
     let answer = ask(address, "GET / HTTP/1.1\r\nHost: 127.0.0.1\r\n\r\n");
     assert!(answer.starts_with("HTTP/1.1 400") && answer.contains("write https://"), "{answer}");
-    // Whoever trusts the certificate gets in; whoever trusts others alone does not.
+    // A client that trusts the certificate connects; one that trusts only others does not.
     let connect = |roots: RootCertStore, origin: &str| {
         let provider = Arc::new(rustls::crypto::ring::default_provider());
         let settings = ClientConfig::builder_with_provider(provider).with_safe_default_protocol_versions().unwrap();
@@ -342,7 +342,7 @@ fn other_computers_are_served_through_https() {
 }
 
 #[test]
-fn half_open_connections_and_floods_hold_nobody_up() {
+fn half_open_connections_and_floods_delay_no_other() {
     let server = server("tcp/127.0.0.1:1", "127.0.0.1:0", false);
     let address = server.address();
     // Nothing is ever said on these.

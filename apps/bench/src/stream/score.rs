@@ -3,7 +3,7 @@
 use anyhow::Result;
 use flyrig_metrics::{CameraScore, Picture, ScoreSheet, person_box, psnr, score_view};
 use flyrig_types::{Mask, RenderedView};
-use flyrig_viewer::{Scene, ShownPerson};
+use flyrig_viewer::{PeopleScene, ShownPerson};
 
 use super::{
     forms::Coded,
@@ -35,7 +35,7 @@ impl Tally {
     }
 
     /// Draws and scores a frame.
-    pub fn add(&mut self, take: &Take, kept: &Kept, coded: &Coded, scene: &mut Scene) -> Result<()> {
+    pub fn add(&mut self, take: &Take, kept: &Kept, coded: &Coded, scene: &mut PeopleScene) -> Result<()> {
         self.sizes.push(coded.bytes);
         self.gaussians = coded.posed.center_scale.len();
         self.motion += coded.motion_bytes;

@@ -4,7 +4,7 @@ use std::fmt::Write as _;
 
 use flyrig_calib::{RigCamera, RigFit};
 use flyrig_report::{Curve, Report, Table};
-use flyrig_types::{Camera, CameraId, ColorMatch, Intrinsics, Isometry};
+use flyrig_types::{Camera, CameraId, ColorMatch, Intrinsics, Isometry, escape_html};
 use glam::{DVec2, DVec3};
 
 use super::advice::Progress;
@@ -170,7 +170,7 @@ fn links(progress: &Progress<'_>) -> String {
             at.y,
             at.x + 9.0,
             at.y - 9.0,
-            escape(id)
+            escape_html(id.as_str())
         );
     }
     svg + "</svg>"
@@ -207,7 +207,7 @@ fn above(ids: &[CameraId], fit: &RigFit) -> String {
             at.y,
             at.x + 8.0,
             at.y - 8.0,
-            escape(id)
+            escape_html(id.as_str())
         );
     }
     svg + "</svg>"
@@ -225,7 +225,7 @@ fn covered_image(of: &Camera, corners: &[DVec2], boards: usize) -> String {
     let _ = write!(
         svg,
         "<text x=\"2\" y=\"{below:.0}\" font-size=\"13\">camera {}: {boards} boards</text></svg>",
-        escape(&of.id)
+        escape_html(of.id.as_str())
     );
     svg
 }
@@ -287,13 +287,27 @@ fn image(id: &CameraId, of: &Camera, camera: &RigCamera) -> String {
         svg,
         "<text x=\"2\" y=\"{:.0}\" font-size=\"13\">camera {}: {} boards, rms {:.3} px</text></svg>",
         height * scale + 15.0,
-        escape(id),
+        escape_html(id.as_str()),
         camera.views,
         camera.rms_px
     );
     svg
 }
 
-fn escape(id: &CameraId) -> String {
-    id.as_str().replace('&', "&amp;").replace('<', "&lt;")
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn names_of_cameras_are_escaped() {
+        let camera = Camera {
+            id: "a<b>\"&".into(),
+            time_offset_nanos: 0,
+            color: ColorMatch::default(),
+            intrinsics: Intrinsics::pinhole(640, 480, 500.0),
+            camera_from_world: Isometry::IDENTITY,
+        };
+        let svg = covered_image(&camera, &[], 3);
+        assert!(svg.contains("a&lt;b&gt;&quot;&amp;") && !svg.contains("a<b"), "{svg}");
+    }
 }

@@ -6,7 +6,7 @@ use std::{cell::RefCell, fs, path::Path, time::Duration};
 use flyrig_body::{load_gltf, parse_bvh};
 use flyrig_calib::load_easymocap;
 use flyrig_capture::{CameraSource as _, FolderOptions, FolderReplay, McapReplay, recorded_notes, to_rgb8};
-use flyrig_page::{MessageKind, Page};
+use flyrig_page::{Page, PageMessageKind};
 use flyrig_renderer::{PlyError, parse_anisotropic_ply};
 use flyrig_transport::{
     CameraStatus, FRAME_HEADER_BYTES, FrameHeader, HEADER_BYTES, Header, RigStats, SplatState, ViewFrame,
@@ -260,11 +260,11 @@ fn stream(input: &[u8]) -> Result<String, String> {
     let (kind, bytes) = input.split_first().ok_or("short")?;
     let mut page = Page::default();
     for known in [RIG, TEMPLATE] {
-        let kind = MessageKind::of(known[0].into()).ok_or("no kind")?;
-        page.take(kind, 0, &known[1..], 0.0).map_err(|error| error.to_string())?;
+        let kind = PageMessageKind::of(known[0].into()).ok_or("no kind")?;
+        page.ingest(kind, 0, &known[1..], 0.0).map_err(|error| error.to_string())?;
     }
-    let kind = MessageKind::of(u32::from(kind % 4)).ok_or("no kind")?;
-    let taken = page.take(kind, 0, bytes, 0.1).map_err(|error| error.to_string());
+    let kind = PageMessageKind::of(u32::from(kind % 4)).ok_or("no kind")?;
+    let taken = page.ingest(kind, 0, bytes, 0.1).map_err(|error| error.to_string());
     page.pose(0.1, true);
     let shown = page.order(64, 64).len();
     taken.map(|()| format!("{kind:?} {}", if shown > 0 { "shown" } else { "hidden" }))

@@ -1,4 +1,4 @@
-//! Calibration reaches everybody, whenever they come.
+//! Calibration reaches all subscribers, whenever they start.
 
 use std::time::Duration;
 

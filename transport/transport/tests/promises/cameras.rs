@@ -1,4 +1,4 @@
-//! Cameras of other computers: what goes in comes out, whoever comes, goes, lies or shares the network.
+//! Cameras of other computers: frames arrive, whichever computers join, leave, lie or share the network.
 
 use std::{
     sync::OnceLock,
@@ -93,7 +93,7 @@ fn a_frame_comes_out_as_it_went_in_with_the_time_of_this_computer() {
         host.publish_status(&right, &status).unwrap();
         there.link(&right).status.is_some_and(|found| found == status)
     });
-    assert_eq!(there.absence(&right), "its computer 'pi-2' says: was unplugged");
+    assert_eq!(there.absence(&right), "its computer 'pi-2' reports: was unplugged");
     let unknown = there.next_frame(&"nobody".into(), Duration::ZERO).unwrap_err();
     assert_eq!(unknown.kind, TransportErrorKind::Config);
     assert!(host.publish(frame("nobody", 1)).unwrap_err().to_string().contains("not one of those"));
@@ -146,12 +146,12 @@ fn a_computer_that_vanishes_and_returns_goes_on() {
     let endpoint = free_endpoint();
     let there = subscriber("test", &["a"], std::slice::from_ref(&endpoint));
     let a = CameraId::from("a");
-    assert!(there.absence(&a).starts_with("no computer of rig 'test' is there; run `flyrig capture` on it"));
+    assert!(there.absence(&a).starts_with("no computer of rig 'test' is present; run `flyrig capture` on it"));
     let mut sequence = 0;
     let first = host("test", &["a"], &endpoint);
     publish_until_seen(&first, &there, "a", &mut sequence);
     drop(first);
-    wait_until("the word that it is gone", || there.absence(&a).contains("its computer is gone from the network"));
+    wait_until("the report that it has left", || there.absence(&a).contains("its computer has left the network"));
     let second = host("test", &["a"], &endpoint);
     // As a restarted program does, it counts from the beginning.
     let found = publish_until_seen(&second, &there, "a", &mut 0);
@@ -171,7 +171,7 @@ fn rigs_of_one_network_do_not_mix_and_a_wrong_name_is_told() {
         assert!(publish_until_seen(&one, &of_one, "a", &mut sequence).sequence < 1_000_000);
     }
     wait_until("the names of the others", || of_three.absence(&"a".into()).contains("'one', 'two'"));
-    assert!(of_three.absence(&"a".into()).contains("set rig.name alike"));
+    assert!(of_three.absence(&"a".into()).contains("set the same rig.name"));
     assert!(of_three.next_frame(&"a".into(), Duration::ZERO).unwrap().is_none());
 }
 
@@ -225,7 +225,7 @@ fn another_version_is_told_once_and_plainly() {
     assert_eq!(error.kind, TransportErrorKind::UnknownVersion);
     stranger.put("flyrig/v1/test/camera/a", vec![0; 8]).attachment(attachment.to_vec()).wait().unwrap();
     wait_until("the second one", || there.link(&"a".into()).refused >= 2);
-    assert!(there.next_frame(&"a".into(), Duration::ZERO).unwrap().is_none(), "not told again at once");
+    assert!(there.next_frame(&"a".into(), Duration::ZERO).unwrap().is_none(), "not reported again at once");
 }
 
 #[test]
@@ -264,7 +264,7 @@ fn hostile_messages_are_refused_and_the_camera_goes_on() {
         put("flyrig/v1/test/camera-status/a", random_bytes(&mut random, 50), vec![]);
     }
     wait_until("the refusals", || there.link(&a).refused > before + 100);
-    let mut told = 0;
+    let mut reported = 0;
     let found = wait_for("a good frame", || {
         sequence += 1;
         host.publish(frame("a", sequence)).unwrap();
@@ -272,14 +272,14 @@ fn hostile_messages_are_refused_and_the_camera_goes_on() {
             Ok(frame) => frame,
             Err(error) => {
                 assert!(!error.to_string().is_empty());
-                told += 1;
+                reported += 1;
                 None
             }
         }
     });
     assert_eq!(found.image.width(), 4);
     assert!(there.link(&a).status.is_none());
-    println!("{} messages refused, told {told} times", there.link(&a).refused - before);
+    println!("{} messages refused, reported {reported} times", there.link(&a).refused - before);
 }
 
 #[test]

@@ -1,4 +1,4 @@
-//! Keys: their holders do what their role lets them, from wherever they connect, and nobody else does anything.
+//! Keys: holders may do what their role allows, wherever they connect, and others nothing.
 
 use std::{
     net::{Ipv4Addr, SocketAddr, TcpListener},
@@ -48,7 +48,7 @@ fn everything() -> Interests {
     Interests { views: Views::All, splats: true, people: true, stats: true }
 }
 
-/// A session of somebody who has a key and sticks to no rules.
+/// Session of a holder of a key that ignores all rules.
 fn outlaw(key: &KeyFile) -> Session {
     use base64::{Engine as _, engine::general_purpose::STANDARD};
     let quoted = |text: &str| serde_json::json!(STANDARD.encode(text)).to_string();
@@ -126,7 +126,7 @@ fn programs_of_the_same_computer_need_no_key() {
 }
 
 #[test]
-fn a_viewer_reads_nobody_elses_viewpoint_and_publishes_nothing() {
+fn a_viewer_reads_no_other_viewpoint_and_publishes_nothing() {
     let (_folder, mut ring) = ring();
     let rig = open_rig(&ring);
     let (honest, spy) = (ring.add("desk", Role::Viewer, 10).unwrap(), ring.add("spy", Role::Viewer, 10).unwrap());
@@ -189,7 +189,7 @@ fn a_revoked_key_is_disconnected_within_two_seconds_and_its_number_may_be_given_
 }
 
 #[test]
-fn whoever_has_no_key_of_this_rig_is_told_so() {
+fn a_missing_or_foreign_key_is_reported() {
     let (_folder, mut ring) = ring();
     let (_other_folder, mut other) = self::ring();
     let rig = open_rig(&ring);
@@ -199,7 +199,7 @@ fn whoever_has_no_key_of_this_rig_is_told_so() {
     // Key of another rig, which expects that one here.
     let at_ours = |key: &KeyFile| KeyFile { connect: desk.connect.clone(), ..key.clone() };
     let reason = refused(at_ours(&spy));
-    assert!(reason.contains("is not the rig 'test': its certificate is signed by somebody else"), "{reason}");
+    assert!(reason.contains("is not the rig 'test': its certificate is signed by another authority"), "{reason}");
     // Key of another rig, whose holder knows our authority.
     let forged = KeyFile { authority: desk.authority.clone(), ..at_ours(&spy) };
     assert!(refused(forged.clone()).contains("refuses the key of 'spy': it is of another rig"));
@@ -253,7 +253,7 @@ fn cameras_of_another_computer_need_a_key_alone_and_read_nothing() {
     let mut sequence = 0;
     cameras::publish_until_seen(&here, &there, "a", &mut sequence);
     assert!(there.link(&"a".into()).clock.is_some(), "the clock was compared");
-    // Nobody else's camera, nothing of the people, even where both are on one computer.
+    // No other camera and nothing of the people, even where both are on one computer.
     let rig = open_publisher(|config| config.connect = Vec::new());
     let outlaw = outlaw(&key);
     let all = count(&outlaw, "**", |_| false);
@@ -289,7 +289,7 @@ fn viewers_come_back_when_the_rig_does() {
 }
 
 #[test]
-fn half_open_connections_of_others_keep_nobody_out() {
+fn half_open_connections_of_others_keep_no_holder_out() {
     let (_folder, mut ring) = ring();
     let rig = open_rig(&ring);
     let key = ring.add("desk", Role::Viewer, 10).unwrap();

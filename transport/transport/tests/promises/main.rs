@@ -1,4 +1,4 @@
-//! What the transport promises, a module for each promise; one binary because every one links zenoh.
+//! Promises of the transport, one module per promise; a single binary because each links zenoh.
 
 #![allow(clippy::unwrap_used, reason = "helpers of tests fail by panicking")]
 

@@ -53,7 +53,7 @@ fn splat_states_that_lie() {
     let with = |at: usize, bytes: &[u8]| {
         let mut state = good.clone();
         state[at..at + bytes.len()].copy_from_slice(bytes);
-        SplatState::decode(&state)
+        SplatState::decode(&state).map_err(TransportError::from)
     };
     assert!(refused(with(0, b"NOPE")).contains("not a splat state"));
     assert_eq!(with(4, &[9, 0]).unwrap_err().kind, TransportErrorKind::UnknownVersion);
@@ -70,8 +70,11 @@ fn splat_states_that_lie() {
     let mut endless = good.clone();
     endless[32..36].copy_from_slice(&f32::MIN.to_le_bytes());
     endless[44..48].copy_from_slice(&f32::MAX.to_le_bytes());
-    assert!(refused(SplatState::decode(&endless)).contains("makes no sense"));
-    assert!(refused(SplatState::decode(&[good.as_slice(), &[0]].concat())).contains("found 1201"));
+    assert!(refused(SplatState::decode(&endless).map_err(TransportError::from)).contains("makes no sense"));
+    assert!(
+        refused(SplatState::decode(&[good.as_slice(), &[0]].concat()).map_err(TransportError::from))
+            .contains("found 1201")
+    );
 }
 
 #[test]

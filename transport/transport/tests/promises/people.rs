@@ -54,7 +54,7 @@ fn a_person_arrives_with_its_template() {
     let fetched = wait_for("the template", || subscriber.template(hash, Duration::from_secs(20)).unwrap());
     assert!(fetched == bytes);
     assert_eq!(StreamTemplate::decode(&fetched).unwrap().gaussians(), 30_000);
-    // Nobody has that one.
+    // No publisher has this template.
     assert_eq!(subscriber.template(hash ^ 1, Duration::from_secs(5)).unwrap(), None);
 
     let stamp = Stamp { template: hash, person: 0, frame: 9, capture_nanos: -3 };

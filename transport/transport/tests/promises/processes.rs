@@ -28,7 +28,7 @@ fn child_watcher() {
     let mut out = std::io::stdout();
     loop {
         if let Ok(Some(received)) = subscriber.next_view(Duration::from_millis(100)) {
-            // The parent is gone when nobody reads.
+            // A failed write means that the parent has ended.
             if writeln!(out, "\nframe {}", received.header.frame).and_then(|()| out.flush()).is_err() {
                 return;
             }
@@ -94,7 +94,7 @@ fn publish(publisher: &Publisher, frame: &mut u64) {
 }
 
 #[test]
-fn a_killed_watcher_is_forgotten_and_costs_nobody_a_frame() {
+fn a_killed_watcher_is_forgotten_and_costs_no_other_a_frame() {
     // A lease this long: only the watcher's vanished token can end its viewpoint.
     let publisher = open_publisher(|config| config.viewpoint_lease_millis = 600_000);
     let healthy =
@@ -119,7 +119,7 @@ fn a_killed_watcher_is_forgotten_and_costs_nobody_a_frame() {
 }
 
 #[test]
-fn a_paused_watcher_slows_nobody_and_catches_up_with_the_newest_frame() {
+fn a_paused_watcher_slows_no_other_and_catches_up_with_the_newest_frame() {
     let publisher = open_publisher(|config| config.viewpoint_lease_millis = 1000);
     let healthy =
         open_subscriber(&publisher, &Interests { views: Views::Named(vec!["front".into()]), ..Interests::default() });

@@ -1,4 +1,4 @@
-//! Publisher and subscribers in one process: what goes in comes out, whoever starts first.
+//! Publisher and subscribers in one process: messages arrive, whichever side starts first.
 
 use std::{sync::Arc, time::Duration};
 
@@ -73,7 +73,7 @@ fn splats_and_statistics_come_out_as_they_went_in() {
 }
 
 #[test]
-fn what_nobody_watches_is_dropped_unencoded_and_counted() {
+fn unwatched_messages_are_dropped_unencoded_and_counted() {
     let publisher = open_publisher(|_| {});
     let named = Interests { views: Views::Named(vec!["a".into()]), ..Interests::default() };
     let subscriber = open_subscriber(&publisher, &named);
@@ -102,7 +102,7 @@ fn bad_names_sizes_and_too_many_views_are_refused() {
         publisher.add_view(&format!("v{i}")).unwrap();
     }
     assert!(publisher.add_view("v64").unwrap_err().to_string().contains("at most 64 views"));
-    // The view of a viewer that never was is nobody's, not an error: a lease may end at any moment.
+    // The view of an unknown viewer is unwatched, not an error: a lease may end at any moment.
     assert_eq!(publisher.publish_view("viewer-ghost", view(1, 10)).unwrap(), PublishOutcome::Unwatched);
 }
 

@@ -2,7 +2,9 @@
 
 use std::{collections::BTreeSet, sync::Arc, time::Duration};
 
-use flyrig_transport::{Interests, MAX_PERSON_TOPICS, MAX_SPLATS, PublishOutcome, SplatState, TransportErrorKind};
+use flyrig_transport::{
+    Interests, MAX_PERSON_TOPICS, MAX_SPLATS, PublishOutcome, SplatState, TransportError, TransportErrorKind,
+};
 
 use crate::support::*;
 
@@ -96,7 +98,7 @@ fn the_edges_none_one_flat_and_too_many() {
     assert_eq!(SplatState::decode(&one.encode().unwrap()).unwrap(), one);
     let many =
         SplatState { center_scale: vec![[0.0; 4]; MAX_SPLATS + 1], color: vec![[0.0; 4]; MAX_SPLATS + 1], ..none };
-    assert_eq!(many.encode().unwrap_err().kind, TransportErrorKind::Config);
+    assert_eq!(TransportError::from(many.encode().unwrap_err()).kind, TransportErrorKind::Config);
     let uneven = SplatState { color: vec![], ..one };
     assert!(uneven.encode().unwrap_err().to_string().contains("1 positions but 0 colours"));
 }

@@ -114,7 +114,7 @@ pub fn rig() -> Rig {
     }
 }
 
-/// The same cameras in the same order, up to rounding of the matrices' inverse.
+/// Asserts equal cameras in equal order, up to rounding of the inverse matrices.
 pub fn assert_same_rig(a: &Rig, b: &Rig) {
     assert!((a.world_up - b.world_up).length() < 1e-12, "{} {}", a.world_up, b.world_up);
     assert_eq!(a.cameras.len(), b.cameras.len());

@@ -31,7 +31,7 @@ fn a_viewpoint_is_granted_moved_seen_and_given_back() {
     let granted = ViewpointStatus::Granted { view: subscriber.viewpoint_view() };
     wait_until("the answer", || subscriber.viewpoint_status() == granted);
 
-    wait_until("somebody to watch it", || publisher.has_subscribers(&asked.view));
+    wait_until("a subscriber of the view", || publisher.has_subscribers(&asked.view));
     let received = publish_until_seen(&publisher, &subscriber, &asked.view, &mut 0);
     assert_eq!(received.topic, subscriber.viewpoint_view());
 
@@ -101,7 +101,7 @@ fn a_lease_outlives_its_length_only_by_renewal() {
     assert!(ask("{".to_owned()).contains(r#""granted":false"#));
     let wide = camera.replace("640", "5000");
     let answer = ask(format!(r#"{{"schema_version":1,"max_fps":5.0,"camera":{wide}}}"#));
-    assert!(answer.contains("5000x480 pixels asked for, at most 4096 a side"), "{answer}");
+    assert!(answer.contains("5000x480 pixels requested, at most 4096 per side"), "{answer}");
     session.close().wait().unwrap();
 }
 
@@ -147,7 +147,7 @@ fn viewers_share_the_pixels_and_a_failure_reaches_only_its_viewer() {
     }
     three.request_viewpoint(&wanted, 30.0).unwrap();
     let reason = wait_for("the refusal", || refusal(&three));
-    assert!(reason.contains("640x480 at 30 a second is 9.2 Mpx/s; 0.0 of the rig's 18.4 Mpx/s are left"), "{reason}");
+    assert!(reason.contains("640x480 at 30 per second is 9.2 Mpx/s; 0.0 of the rig's 18.4 Mpx/s are left"), "{reason}");
     one.release_viewpoint();
     wait_until("the third", || is_granted(&three));
 
@@ -177,14 +177,14 @@ fn due_viewpoints_are_watched_ones_at_their_own_rate() {
     let subscriber = open_subscriber(&publisher, &Interests::default());
     subscriber.request_viewpoint(&camera("mine", Lens::PINHOLE), 10.0).unwrap();
     let viewpoint = wait_for("the request", || publisher.requested_viewpoints().pop());
-    wait_until("somebody to watch it", || publisher.has_subscribers(&viewpoint.view));
-    // Two seconds of a rig at 30 a second, without waiting for them.
+    wait_until("a subscriber of the view", || publisher.has_subscribers(&viewpoint.view));
+    // Two seconds of a rig at 30 frame sets per second, without waiting for them.
     let start = Instant::now();
     let due = |set: u32| publisher.due_viewpoints(start + Duration::from_secs(1) * set / 30);
     let taken: Vec<u32> = (0..60).filter(|set| due(*set) == [viewpoint.clone()]).collect();
     assert_eq!(taken, (0..20).map(|n| 3 * n).collect::<Vec<_>>());
 
-    // A request by hand that nobody watches is granted and never drawn.
+    // A request without a subscription is granted and never drawn.
     let session = client(publisher.endpoints());
     let camera = serde_json::to_string(&camera("\u{1b}[2J", Lens::PINHOLE)).unwrap();
     let question = format!(r#"{{"schema_version":1,"max_fps":5.0,"camera":{camera}}}"#);

@@ -1,0 +1,297 @@
+//! TCP listener with bounds, shared by the gate, the web page and the metrics page.
+//!
+//! One thread accepts connections and serves them as tasks. Connections beyond [`Bounds::connections`] wait in the system's queue.
+//! Where [`Bounds::per_address`] is set, an address that begins too many connections, or has too many handshakes under way, is
+//! disconnected at once ([`crate::limits`]); the place of a handshake is given back by [`Connection::established`].
+
+use std::{
+    future::{Future, pending},
+    io::{Error, ErrorKind, Result},
+    net::{IpAddr, SocketAddr, ToSocketAddrs},
+    sync::{Arc, Mutex},
+    thread::{Builder, JoinHandle},
+    time::{Duration, Instant},
+};
+
+use flyrig_types::lock;
+use socket2::{Domain, Protocol, Socket, Type};
+use tokio::{
+    net::{TcpListener, TcpStream},
+    runtime,
+    sync::{OwnedSemaphorePermit, Semaphore, oneshot},
+    time::sleep,
+};
+
+use crate::limits::Limits;
+
+/// Pause after a connection could not be accepted: with no file descriptor left, an immediate retry only costs time.
+const PAUSE: Duration = Duration::from_millis(100);
+/// Connections that the system queues until they are accepted.
+const BACKLOG: i32 = 1024;
+/// Bytes that the system keeps per streaming connection, sent or not: enough for 20 Mbit/s with 200 ms. Linux doubles it.
+const SEND_BUFFER: usize = 256 << 10;
+/// Bytes of [`SEND_BUFFER`] that may be unsent: newer motion cannot overtake them.
+#[cfg(target_os = "linux")]
+const UNSENT: u32 = 4 << 10;
+
+/// Bounds and socket options of a [`Listener`].
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub struct Bounds {
+    /// Most connections served at a time.
+    pub connections: usize,
+    /// Whether connections are bounded per address until they are established.
+    pub per_address: bool,
+    /// Whether connections stream to viewers: small writes leave at once, and little waits unsent in the socket.
+    pub is_streaming: bool,
+}
+
+/// Service behind a [`Listener`].
+pub trait Serve: Send + Sync + 'static {
+    /// Serves one connection until it ends.
+    fn serve(self: Arc<Self>, connection: Connection) -> impl Future<Output = ()> + Send;
+
+    /// Reports an address that was disconnected because it exceeds the bounds per address.
+    fn refuse(&self, _address: IpAddr) {}
+
+    /// Runs beside the connections; the listener ends when it returns.
+    fn beside(&self) -> impl Future<Output = ()> + Send {
+        pending()
+    }
+}
+
+/// Connection that was accepted.
+#[derive(Debug)]
+pub struct Connection {
+    /// The stream; it and the connection's place live independently.
+    pub stream: TcpStream,
+    /// Address of the other side.
+    pub address: IpAddr,
+    /// ConnectionPlace among the connections.
+    pub place: ConnectionPlace,
+}
+
+/// ConnectionPlace of a connection among all of its listener, given back when it is dropped.
+#[derive(Debug)]
+pub struct ConnectionPlace {
+    _permit: OwnedSemaphorePermit,
+    /// Counts of the listener, while the connection is not established and counts by address.
+    handshake: Option<(Arc<Mutex<Limits>>, IpAddr)>,
+}
+
+impl ConnectionPlace {
+    /// Ends the handshake: the connection does not count against its address any more.
+    pub fn established(&mut self) {
+        if let Some((limits, address)) = self.handshake.take() {
+            lock(&limits).end(address);
+        }
+    }
+}
+
+impl Drop for ConnectionPlace {
+    fn drop(&mut self) {
+        self.established();
+    }
+}
+
+/// Address that is listened on, before connections are served.
+#[derive(Debug)]
+pub struct BoundListener {
+    listener: std::net::TcpListener,
+    address: SocketAddr,
+    bounds: Bounds,
+}
+
+/// Serves connections on a thread of its own until it is dropped; open connections end with it.
+#[derive(Debug)]
+pub struct Listener {
+    address: SocketAddr,
+    /// Ends the thread when it is dropped.
+    stop: Option<oneshot::Sender<()>>,
+    thread: Option<JoinHandle<()>>,
+}
+
+impl Listener {
+    /// Listens on the first usable of these addresses; port 0 takes a free one. Connections wait until [`BoundListener::start`].
+    ///
+    /// # Errors
+    /// Error of the operating system for the last address.
+    pub fn bind(addresses: impl ToSocketAddrs, bounds: Bounds) -> Result<BoundListener> {
+        let mut result = Err(Error::new(ErrorKind::InvalidInput, "no address to listen on"));
+        for address in addresses.to_socket_addrs()? {
+            result = listen(address, bounds);
+            if result.is_ok() {
+                break;
+            }
+        }
+        let listener = result?;
+        let address = listener.local_addr()?;
+        Ok(BoundListener { listener, address, bounds })
+    }
+
+    /// Returns the address that is listened on.
+    #[must_use]
+    pub fn address(&self) -> SocketAddr {
+        self.address
+    }
+}
+
+impl Drop for Listener {
+    fn drop(&mut self) {
+        drop(self.stop.take());
+        if let Some(thread) = self.thread.take() {
+            let _ = thread.join();
+        }
+    }
+}
+
+impl BoundListener {
+    /// Returns the address that is listened on.
+    #[must_use]
+    pub fn address(&self) -> SocketAddr {
+        self.address
+    }
+
+    /// Serves connections on a thread of this name.
+    ///
+    /// # Errors
+    /// When the system starts no thread or runtime.
+    pub fn start(self, thread: &str, service: Arc<impl Serve>) -> Result<Listener> {
+        let Self { listener, address, bounds } = self;
+        let runtime = runtime::Builder::new_current_thread().enable_io().enable_time().build()?;
+        let listener = {
+            let _inside = runtime.enter();
+            TcpListener::from_std(listener)?
+        };
+        let (stop, stopped) = oneshot::channel::<()>();
+        let work = move || {
+            runtime.block_on(async {
+                tokio::select! {
+                    () = accept(&listener, bounds, &service) => {}
+                    () = service.beside() => {}
+                    _ = stopped => {}
+                }
+            });
+            // Messages under way are dropped with their tasks.
+            runtime.shutdown_timeout(PAUSE);
+        };
+        let thread = Builder::new().name(thread.to_owned()).spawn(work)?;
+        Ok(Listener { address, stop: Some(stop), thread: Some(thread) })
+    }
+}
+
+fn listen(address: SocketAddr, bounds: Bounds) -> Result<std::net::TcpListener> {
+    let socket = Socket::new(Domain::for_address(address), Type::STREAM, Some(Protocol::TCP))?;
+    socket.set_reuse_address(cfg!(unix))?;
+    if bounds.is_streaming {
+        // Connections inherit it.
+        socket.set_send_buffer_size(SEND_BUFFER)?;
+    }
+    socket.bind(&address.into())?;
+    socket.listen(BACKLOG)?;
+    socket.set_nonblocking(true)?;
+    Ok(socket.into())
+}
+
+async fn accept(listener: &TcpListener, bounds: Bounds, service: &Arc<impl Serve>) {
+    let permits = Arc::new(Semaphore::new(bounds.connections));
+    let limits = bounds.per_address.then(|| Arc::new(Mutex::new(Limits::default())));
+    while let Ok(permit) = Arc::clone(&permits).acquire_owned().await {
+        let Ok((stream, address)) = listener.accept().await else {
+            sleep(PAUSE).await;
+            continue;
+        };
+        let address = address.ip();
+        let begins = |limits: &Mutex<Limits>| lock(&limits).begin(address, Instant::now());
+        if limits.as_deref().is_some_and(|limits| !begins(limits)) {
+            service.refuse(address);
+            continue;
+        }
+        if bounds.is_streaming {
+            let _ = stream.set_nodelay(true);
+            #[cfg(target_os = "linux")]
+            let _ = socket2::SockRef::from(&stream).set_tcp_notsent_lowat(UNSENT);
+        }
+        let place = ConnectionPlace { _permit: permit, handshake: limits.clone().map(|limits| (limits, address)) };
+        tokio::spawn(Arc::clone(service).serve(Connection { stream, address, place }));
+    }
+}
+
+#[cfg(test)]
+#[allow(clippy::unwrap_used)]
+mod tests {
+    use std::{
+        io::{Read as _, Write as _},
+        net::{Ipv4Addr, TcpStream as Client},
+    };
+
+    use tokio::io::{AsyncReadExt as _, AsyncWriteExt as _};
+
+    use super::*;
+
+    /// Answers a byte with itself plus one, then holds the connection; counts refusals.
+    #[derive(Default)]
+    struct Echo(Mutex<usize>);
+
+    impl Serve for Echo {
+        async fn serve(self: Arc<Self>, mut connection: Connection) {
+            let mut byte = [0];
+            while connection.stream.read_exact(&mut byte).await.is_ok() {
+                connection.place.established();
+                let _ = connection.stream.write_all(&[byte[0] + 1]).await;
+            }
+        }
+
+        fn refuse(&self, _address: IpAddr) {
+            *self.0.lock().unwrap() += 1;
+        }
+    }
+
+    fn start(connections: usize, per_address: bool) -> (Arc<Echo>, Listener) {
+        let bounds = Bounds { connections, per_address, is_streaming: true };
+        let service = Arc::<Echo>::default();
+        let bound = Listener::bind((Ipv4Addr::LOCALHOST, 0), bounds).unwrap();
+        let listener = bound.start("echo", Arc::clone(&service)).unwrap();
+        (service, listener)
+    }
+
+    fn connect(listener: &Listener) -> Client {
+        let client = Client::connect(listener.address()).unwrap();
+        client.set_read_timeout(Some(Duration::from_millis(300))).unwrap();
+        client
+    }
+
+    fn is_answered(client: &mut Client) -> bool {
+        let mut byte = [0];
+        client.write_all(&[7]).is_ok() && client.read_exact(&mut byte).is_ok() && byte == [8]
+    }
+
+    #[test]
+    fn connections_beyond_the_bound_wait_for_a_place() {
+        let (_, listener) = start(2, false);
+        let mut open: Vec<Client> = (0..3).map(|_| connect(&listener)).collect();
+        assert!(is_answered(&mut open[0]) && is_answered(&mut open[1]));
+        assert!(!is_answered(&mut open[2]));
+        drop(open.remove(0));
+        open[1].set_read_timeout(Some(Duration::from_secs(20))).unwrap();
+        let mut byte = [0];
+        open[1].read_exact(&mut byte).unwrap();
+        assert_eq!(byte, [8], "the byte that waited");
+        let address = listener.address();
+        drop(listener);
+        assert!(Client::connect(address).is_err(), "a listener that was dropped listens no more");
+    }
+
+    #[test]
+    fn one_address_has_its_share_of_handshakes() {
+        let (service, listener) = start(100, true);
+        let mut open: Vec<Client> = (0..30).map(|_| connect(&listener)).collect();
+        let end = Instant::now() + Duration::from_secs(20);
+        while *service.0.lock().unwrap() < 14 && Instant::now() < end {
+            std::thread::sleep(Duration::from_millis(10));
+        }
+        assert_eq!(*service.0.lock().unwrap(), 14, "16 of 30 handshakes are under way");
+        // An established connection counts no more.
+        assert!(is_answered(&mut open[0]));
+        assert!(is_answered(&mut connect(&listener)));
+    }
+}

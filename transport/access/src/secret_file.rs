@@ -1,0 +1,22 @@
+//! Files that only their owner may read.
+
+use std::{io::Write as _, path::Path};
+
+use crate::error::AccessError;
+
+/// Writes a new file for its owner alone; refuses to replace one.
+pub(crate) fn write_secret(path: &Path, text: &str) -> Result<(), AccessError> {
+    let mut options = std::fs::OpenOptions::new();
+    options.write(true).create_new(true);
+    #[cfg(unix)]
+    std::os::unix::fs::OpenOptionsExt::mode(&mut options, 0o600);
+    let written = options
+        .open(path)
+        .and_then(|mut out| out.write_all(text.as_bytes()).inspect_err(|_| drop(std::fs::remove_file(path))));
+    written.map_err(|error| match error.kind() {
+        std::io::ErrorKind::AlreadyExists => {
+            AccessError::file(path, "is there already; choose another name, or move it away")
+        }
+        _ => AccessError::file(path, format!("cannot be written ({error})")),
+    })
+}
