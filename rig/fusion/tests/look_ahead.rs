@@ -10,8 +10,8 @@ use std::{
 
 use flyrig_capture::Pacing;
 use flyrig_fusion::{
-    FusionError, GivenPerception, InputFormat, Intake, KnownPerson, LiveRig, LiveViews, Observation, Outcome,
-    OutputSettings, Perception, SessionBuilder, StageTimes,
+    FusionError, GivenPerception, InputFormat, Intake, KnownPerson, LiveRig, LiveViews, Outcome, OutputSettings,
+    Perception, PersonObservation, SessionBuilder, StageTimes,
 };
 use flyrig_sync::SyncSettings;
 use flyrig_types::{FrameSet, PersonId};
@@ -32,7 +32,7 @@ impl Perception for Logged {
         self.inner.people()
     }
 
-    fn observe(&mut self, set: &FrameSet, stages: &mut StageTimes) -> Result<Vec<Observation>, FusionError> {
+    fn observe(&mut self, set: &FrameSet, stages: &mut StageTimes) -> Result<Vec<PersonObservation>, FusionError> {
         let thread = std::thread::current().name().unwrap_or_default().to_owned();
         self.log.lock().unwrap().push((set.index, thread));
         self.inner.observe(set, stages)

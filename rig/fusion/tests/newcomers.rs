@@ -7,7 +7,8 @@ use std::time::{Duration, Instant};
 
 use flyrig_body::Template;
 use flyrig_fusion::{
-    FusionError, GivenPerception, KnownPerson, Observation, Outcome, Perception, Session, SessionBuilder, StageTimes,
+    FusionError, GivenPerception, KnownPerson, Outcome, Perception, PersonObservation, Session, SessionBuilder,
+    StageTimes,
 };
 use flyrig_types::{FrameSet, PersonId};
 
@@ -33,7 +34,7 @@ impl Perception for Late {
             .collect()
     }
 
-    fn observe(&mut self, set: &FrameSet, stages: &mut StageTimes) -> Result<Vec<Observation>, FusionError> {
+    fn observe(&mut self, set: &FrameSet, stages: &mut StageTimes) -> Result<Vec<PersonObservation>, FusionError> {
         self.seen += 1;
         let observed = self.inner.observe(set, stages)?;
         Ok(if self.seen >= self.known_after { observed } else { Vec::new() })

@@ -7,8 +7,8 @@ use std::time::Duration;
 
 use flyrig_capture::Pacing;
 use flyrig_fusion::{
-    FusionError, GivenPerception, InputFormat, Intake, KnownPerson, LiveRig, LiveViews, Observation, Outcome,
-    OutputSettings, Perception, SessionBuilder, StageTimes,
+    FusionError, GivenPerception, InputFormat, Intake, KnownPerson, LiveRig, LiveViews, Outcome, OutputSettings,
+    Perception, PersonObservation, SessionBuilder, StageTimes,
 };
 use flyrig_sync::SyncSettings;
 use flyrig_types::{FrameSet, PersonId, SupervisedThread};
@@ -28,7 +28,7 @@ impl Perception for Unlucky {
         self.inner.people()
     }
 
-    fn observe(&mut self, set: &FrameSet, stages: &mut StageTimes) -> Result<Vec<Observation>, FusionError> {
+    fn observe(&mut self, set: &FrameSet, stages: &mut StageTimes) -> Result<Vec<PersonObservation>, FusionError> {
         assert!(!(self.panics_at)(set.index), "set {}", set.index);
         self.inner.observe(set, stages)
     }

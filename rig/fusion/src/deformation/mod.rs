@@ -1,108 +1,82 @@
-//! Deformation tracking on the GPU: draws the Gaussians with the colours of the last instant into every input view and
-//! passes the image residuals to the solver (FlyHuman Eq. 3).
+//! Deformation tracking on the GPU (FlyHuman, Eq. 3), unless `tracking.solver` is "off".
+//!
+//! 30,000 of the Gaussians, moved inside of the surface that they draw ([`SurfaceGaussians::inset`]), are drawn into every input view in
+//! the pose of that image's own time, with the sharpened colours of earlier instants, and compared with halved images ([`images`]).
+//! `tracker::DeformTracker` turns the image residuals into steps of the deformation graph's nodes; it knows no GPU and sees the images
+//! only through its data term. The nodes then move all Gaussians and the template's vertices ([`motion`]).
+//!
+//! Resolution ([`area`]) and number of Gaussians ([`options`]) are bounded by what is informative, and of many views those from the most
+//! different directions are compared ([`view_choice`]). `stability_tests.rs` runs the chain beside a plain f64 copy of itself: a change to
+//! the loss, the solver or the choice of images changes that copy too.
 
 mod area;
-mod choose;
 mod images;
 mod motion;
-mod options;
+pub(crate) mod options;
+pub(crate) mod scene;
+mod view_choice;
 
-use std::time::{Duration, Instant};
+use std::time::Instant;
 
-use flyrig_body::{DeformationGraph, GpuSkinner, Part, Skeleton, SurfaceGaussians, Template, coarsen};
+use flyrig_body::{DeformationGraph, GpuSkinner, Part, SurfaceGaussians, Template, coarsen};
 use flyrig_gpu::{GpuContext, StorageBuffer};
 use flyrig_renderer::{BackwardRasterizer, ColorMeans, GaussianBuffers, GaussianGradients, ImageLoss};
 use flyrig_tracker::{DeformReport, DeformTracker};
-use flyrig_types::{Camera, Pose};
+use flyrig_types::Camera;
 use glam::{DVec3, Vec3};
 
-use self::area::Landmarks;
-use self::choose::Chooser;
-use self::images::{Images, Kernels, ViewBuffers};
-use self::motion::MeshMotion;
-pub use self::options::{DeformOptions, PAPER_COLOR_WEIGHT};
-use crate::FusionError;
+use crate::error::FusionError;
 
-/// Share of the last instant's colours in those that are compared. Painting follows the surface wherever it slides; colours
-/// that remember where cloth was hold it there.
+pub use options::{DeformOptions, PAPER_COLOR_WEIGHT};
+pub(crate) use scene::DeformTimes;
+
+use area::{Landmarks, ViewPlan};
+use images::{DeformKernels, Images, ViewBuffers};
+use motion::MeshMotion;
+use scene::{TrackedPerson, TrackedView, ViewAgreement};
+use view_choice::ViewChooser;
+
+/// Share of the last painting's colours in those that are compared. Painting follows the surface wherever it slides; colours that
+/// remember where cloth was hold it there.
 const COLOR_RATE: f32 = 0.03;
 
-/// The tracked deformation and the buffers it is solved with.
+/// Tracked deformation of one person, and the buffers that it is solved with.
 #[derive(Debug)]
 pub struct Deformation {
     max_level: u32,
     color_weight: f32,
     most_views: usize,
-    chooser: Chooser,
+    chooser: ViewChooser,
     tracker: DeformTracker,
     backward: BackwardRasterizer,
     loss: ImageLoss,
-    /// Of the coarse Gaussians that are compared, and of all of them.
+    /// Canonical displacement of the coarse Gaussians, which are compared.
     coarse_displacement: StorageBuffer<[f32; 4]>,
+    /// Canonical displacement of all Gaussians.
     displacement: StorageBuffer<[f32; 4]>,
     skinner: GpuSkinner,
     colors: ColorMeans,
-    /// The coarse Gaussians, one an instant.
+    /// Coarse Gaussians, one element per instant.
     posed: Vec<GaussianBuffers>,
     spacing_m: f64,
     mesh: MeshMotion,
-    /// One an instant.
+    /// Derivatives with respect to the coarse Gaussians, one element per instant.
     gradients: Vec<GaussianGradients>,
     views: Vec<ViewBuffers>,
     landmarks: Landmarks,
     report: Option<DeformReport>,
-    /// Of the views of the last frame that were compared: how much of the person is where the image shows it, and whether
-    /// it counted.
-    judged: Vec<Option<(f64, bool)>>,
-    /// Views of the last frame whose images were halved.
+    /// Agreement of each view of the last frame set; `None` for one that was not compared.
+    agreement: Vec<Option<ViewAgreement>>,
+    /// Views of the last frame set whose images were halved.
     halved: usize,
-    /// Whether the Gaussians have colours yet.
-    painted: bool,
-    /// Whether the coarse ones had colours in the last frame.
-    colored: bool,
-}
-
-/// One image that the person is compared with.
-#[derive(Debug, Clone, Copy)]
-pub struct TrackedView<'a> {
-    pub camera: &'a Camera,
-    /// Pixels, width and height.
-    pub size: [u32; 2],
-    /// sRGB bytes with mask coverage, row by row.
-    pub rgba: &'a [u8],
-    /// The same on the GPU, a pixel an element.
-    pub words: &'a StorageBuffer<u32>,
-    /// Whether pixels may be marked as unknown ([`flyrig_renderer::LossSettings::with_unknown`]).
-    pub with_unknown: bool,
-    /// Which of the [`Instants`] the image was taken at.
-    pub instant: usize,
-}
-
-/// The person at the instants of one set.
-pub struct Instants<'a> {
-    pub gpu: &'a GpuContext,
-    pub skeleton: &'a Skeleton,
-    /// Poses of the instants that images were taken at.
-    pub poses: &'a [&'a Pose],
-    /// All Gaussians, as they were painted last.
-    pub gaussians: &'a GaussianBuffers,
-}
-
-/// Run times of one frame's solve.
-#[derive(Debug, Clone, Copy, Default)]
-pub struct DeformTimes {
-    /// Uploading and preparing the images.
-    pub prepare: Duration,
-    /// Skinning, drawing and comparing.
-    pub draw: Duration,
-    /// Backward rasteriser and reading its sums back.
-    pub derivatives: Duration,
-    /// The rest: gathering at the nodes and solving for the step.
-    pub solve: Duration,
+    /// Whether the Gaussians have been painted.
+    has_colors: bool,
+    /// Whether the coarse Gaussians had colours in the last frame set.
+    had_colors: bool,
 }
 
 impl Deformation {
-    /// At rest, for these Gaussians, before cameras whose finest pixel covers `pixel_m` of the person.
+    /// Creates the undeformed state of these Gaussians. The finest pixel of the cameras covers `pixel_m` metres of the person.
     pub fn new(
         gpu: &GpuContext,
         template: &Template,
@@ -127,7 +101,7 @@ impl Deformation {
             max_level: options.max_level,
             color_weight: options.color_weight,
             most_views: options.views,
-            chooser: Chooser::default(),
+            chooser: ViewChooser::default(),
             tracker,
             backward: BackwardRasterizer::new(gpu)?,
             loss: ImageLoss::new(gpu)?,
@@ -142,25 +116,78 @@ impl Deformation {
             views: Vec::new(),
             landmarks,
             report: None,
-            judged: Vec::new(),
+            agreement: Vec::new(),
             halved: 0,
-            painted: false,
-            colored: false,
+            has_colors: false,
+            had_colors: false,
         })
     }
 
-    /// Solves one instant. Afterwards [`Self::displacement`] holds its result.
-    pub fn track(&mut self, scene: Instants<'_>, all_views: &[TrackedView<'_>]) -> Result<DeformTimes, FusionError> {
-        let start = Instant::now();
-        let gpu = scene.gpu;
-        let cameras: Vec<&Camera> = all_views.iter().map(|view| view.camera).collect();
-        let center = scene.poses.first().map_or(DVec3::ZERO, |pose| self.landmarks.center(scene.skeleton, pose));
-        let chosen = self.chooser.choose(&cameras, center, self.most_views);
+    /// Solves the deformation for one frame set. Afterwards [`Self::displacement`] holds its result.
+    ///
+    /// # Errors
+    /// [`FusionError::Gpu`] and errors of the solver.
+    pub fn track(
+        &mut self,
+        person: TrackedPerson<'_>,
+        all_views: &[TrackedView<'_>],
+    ) -> Result<DeformTimes, FusionError> {
+        let (start, gpu) = (Instant::now(), person.gpu);
+        let chosen = self.choose(&person, all_views);
         let views: &[TrackedView<'_>] = &chosen.iter().map(|&i| all_views[i]).collect::<Vec<_>>();
-        let count = self.posed[0].count();
-        let plans = self.landmarks.plans(scene.skeleton, scene.poses, views, self.spacing_m, self.max_level);
+        let plans = self.landmarks.plans(person.skeleton, person.poses, views, self.spacing_m, self.max_level);
         self.halved = plans.iter().filter(|plan| plan.level > 0).count();
-        for (i, (view, plan)) in views.iter().zip(&plans).enumerate() {
+        self.reserve(gpu, person.poses.len(), views, &plans)?;
+        if self.views.is_empty() {
+            return Ok(Default::default());
+        }
+        self.update_colors(&person);
+        let mut images = Images::new(
+            person,
+            views,
+            &plans,
+            &mut self.views,
+            DeformKernels {
+                skinner: &self.skinner,
+                posed: &self.posed,
+                loss: &self.loss,
+                backward: &mut self.backward,
+                displacement: &self.coarse_displacement,
+                gradients: &self.gradients,
+            },
+            if self.has_colors { self.color_weight } else { 0.0 },
+        );
+        let prepare = start.elapsed();
+        images.distrust(self.tracker.displacement())?;
+        let report = self.tracker.track(&mut images)?;
+        let agreement = images.agreement(self.tracker.displacement());
+        let (draw, derivatives) = images.times();
+        self.keep_agreement(all_views, &chosen, &agreement);
+        self.displacement.write(gpu, self.mesh.follow(self.tracker.translations()));
+        self.has_colors |= !views.is_empty();
+        let solve = start.elapsed().saturating_sub(prepare + draw + derivatives);
+        tracing::debug!(?report, "deformation");
+        self.report = Some(report);
+        Ok(DeformTimes { prepare, draw, derivatives, solve })
+    }
+
+    /// Chooses the views that are compared, as ascending indices.
+    fn choose(&mut self, person: &TrackedPerson<'_>, all_views: &[TrackedView<'_>]) -> Vec<usize> {
+        let cameras: Vec<&Camera> = all_views.iter().map(|view| view.camera).collect();
+        let center = person.poses.first().map_or(DVec3::ZERO, |pose| self.landmarks.center(person.skeleton, pose));
+        self.chooser.choose(&cameras, center, self.most_views)
+    }
+
+    /// Creates the buffers that these views and instants need and that do not exist yet.
+    fn reserve(
+        &mut self,
+        gpu: &GpuContext,
+        instants: usize,
+        views: &[TrackedView<'_>],
+        plans: &[ViewPlan],
+    ) -> Result<(), FusionError> {
+        let count = self.posed[0].count();
+        for (i, (view, plan)) in views.iter().zip(plans).enumerate() {
             let fits = self.views.get(i).is_some_and(|v| v.fits(view.size, plan.level));
             if !fits {
                 let buffers = ViewBuffers::new(gpu, count, view.size, plan.level)?;
@@ -171,111 +198,91 @@ impl Deformation {
                 }
             }
         }
-        while self.posed.len() < scene.poses.len() {
+        while self.posed.len() < instants {
             self.posed.push(self.posed[0].posed_again(gpu)?);
         }
-        while self.gradients.len() < scene.poses.len() {
+        while self.gradients.len() < instants {
             self.gradients.push(GaussianGradients::zeroed(gpu, count)?);
         }
-        self.loss.reserve(gpu, views.len())?;
-        if self.views.is_empty() {
-            return Ok(Default::default());
-        }
+        Ok(self.loss.reserve(gpu, views.len())?)
+    }
+
+    /// Moves the colours of the coarse Gaussians towards those of the last painting.
+    fn update_colors(&mut self, person: &TrackedPerson<'_>) {
+        let gpu = person.gpu;
         let mut encoder = gpu.device.create_command_encoder(&Default::default());
-        let rate = if self.colored { COLOR_RATE } else { 1.0 };
-        self.colored = self.painted;
-        self.colors.encode(gpu, &mut encoder, &scene.gaussians.color, &self.posed[0].color, rate);
+        let rate = if self.had_colors { COLOR_RATE } else { 1.0 };
+        self.had_colors = self.has_colors;
+        self.colors.encode(gpu, &mut encoder, &person.gaussians.color, &self.posed[0].color, rate);
         gpu.queue.submit([encoder.finish()]);
-        let mut pictures = Images::new(
-            scene,
-            views,
-            &plans,
-            &mut self.views,
-            Kernels {
-                skinner: &self.skinner,
-                posed: &self.posed,
-                loss: &self.loss,
-                backward: &mut self.backward,
-                displacement: &self.coarse_displacement,
-                gradients: &self.gradients,
-            },
-            if self.painted { self.color_weight } else { 0.0 },
-        );
-        let prepare = start.elapsed();
-        pictures.distrust(self.tracker.displacement())?;
-        let report = self.tracker.track(&mut pictures)?;
-        let judged = pictures.judged(self.tracker.displacement());
-        let (draw, derivatives) = pictures.times();
-        self.judged.clear();
-        self.judged.resize(all_views.len(), None);
-        for (&i, judged) in chosen.iter().zip(judged) {
-            self.judged[i] = Some(judged);
-            if !judged.1 {
-                self.chooser.doubt(&all_views[i].camera.id);
+    }
+
+    /// Stores the agreement of the compared views, and chooses distrusted ones less often.
+    fn keep_agreement(&mut self, all_views: &[TrackedView<'_>], chosen: &[usize], agreement: &[ViewAgreement]) {
+        self.agreement.clear();
+        self.agreement.resize(all_views.len(), None);
+        for (&i, &agreement) in chosen.iter().zip(agreement) {
+            self.agreement[i] = Some(agreement);
+            if !agreement.is_trusted {
+                self.chooser.distrust(&all_views[i].camera.id);
             }
         }
-        self.displacement.write(gpu, self.mesh.follow(self.tracker.translations()));
-        self.painted |= !views.is_empty();
-        let solve = start.elapsed().saturating_sub(prepare + draw + derivatives);
-        tracing::debug!(?report, "deformation");
-        self.report = Some(report);
-        Ok(DeformTimes { prepare, draw, derivatives, solve })
     }
 
-    /// Back to rest, for a person who was not there before.
+    /// Returns to the undeformed body, for another person.
     pub fn reset(&mut self) {
         self.tracker.reset();
-        self.painted = false;
+        self.has_colors = false;
     }
 
-    /// Canonical translations of the graph's nodes, metres.
+    /// Returns the canonical translations of the graph's nodes, metres.
     pub fn translations(&self) -> &[DVec3] {
         self.tracker.translations()
     }
 
-    /// Resumes from the translations of an earlier deformation of the same body; the Gaussians have colours already.
+    /// Resumes from the node translations, metres, of an earlier deformation of the same body, whose Gaussians have colours already.
     pub fn resume(&mut self, gpu: &GpuContext, translations: &[DVec3]) -> Result<(), FusionError> {
         self.tracker.resume(translations)?;
         self.displacement.write(gpu, self.mesh.follow(self.tracker.translations()));
-        (self.painted, self.colored) = (true, false);
+        (self.has_colors, self.had_colors) = (true, false);
         Ok(())
     }
 
-    /// The next frames get the iterations of a start.
+    /// Gives the next frame sets the iterations of a start.
     pub fn restart(&mut self) {
         self.tracker.restart();
     }
 
-    /// By view of the last frame: how much of the person is where the image shows it (1: all; 0: as much is wrong as there
-    /// is), and whether the view counted: one that disagrees with all others does not. None for one that was not compared.
-    pub fn judged(&self) -> &[Option<(f64, bool)>] {
-        &self.judged
+    /// Returns the agreement of each view of the last frame set; `None` for one that was not compared.
+    pub fn agreement(&self) -> &[Option<ViewAgreement>] {
+        &self.agreement
     }
 
-    /// How many Gaussians are compared with the images.
+    /// Returns the number of Gaussians that are compared with the images.
     pub fn compared(&self) -> usize {
         self.posed[0].count()
     }
 
-    /// Views of the last frame whose images were compared at a half of their size or less.
+    /// Returns the number of views of the last frame set whose images were compared at half of their size or less.
     pub fn halved_images(&self) -> usize {
         self.halved
     }
 
-    /// What the last solve did.
+    /// Returns the report of the last solve.
     pub fn report(&self) -> Option<&DeformReport> {
         self.report.as_ref()
     }
 
-    /// Canonical displacement of every Gaussian.
+    /// Returns the canonical displacement of every Gaussian, metres.
     pub fn displacement(&self) -> &StorageBuffer<[f32; 4]> {
         &self.displacement
     }
 
-    /// Canonical displacement of every vertex of the template, metres.
+    /// Returns the canonical displacement of every vertex of the template, metres.
     pub fn vertex_displacement(&self) -> Vec<Vec3> {
         self.mesh.of_vertices()
     }
 }
+
 #[cfg(test)]
 mod stability_tests;

@@ -18,7 +18,7 @@ use flyrig_types::{Frame, FrameSet, Image, Mask, PersonId, PixelFormat, PoseTrac
 use glam::DVec3;
 
 use self::chain::Chain;
-use self::small_scene::{Device, Shot, SmallScene};
+use self::small_scene::{SceneShot, SmallScene, TestedDeformation};
 use super::*;
 use crate::{BodySettings, GivenPerception, SessionBuilder, SessionSettings, TrackingSettings};
 
@@ -69,7 +69,7 @@ fn apart(ours: &[[f32; 4]], reference: &[DVec3]) -> Apart {
 fn diverge(frames: usize) -> Vec<Row> {
     let scene = SmallScene::new(80, 10, 48);
     let settings = DeformSettings::default();
-    let mut device = Device::new(gpu(), &scene, options());
+    let mut device = TestedDeformation::new(gpu(), &scene, options());
     let mut same = Chain::new(&scene, settings, 1, 1e-3);
     let mut exact = Chain::new(&scene, settings, 1, 1e-12);
     let rest = scene.surface.inset();
@@ -77,7 +77,7 @@ fn diverge(frames: usize) -> Vec<Row> {
         let shot = scene.shot(frame as f64);
         let report = device.track(&scene, &shot).unwrap();
         assert!(
-            device.deformation.judged().iter().all(|judged| judged.is_some_and(|(_, trusted)| trusted)),
+            device.deformation.agreement().iter().all(|view| view.is_some_and(|view| view.is_trusted)),
             "every view counts"
         );
         let losses = same.track(&shot);
@@ -160,9 +160,9 @@ fn the_chain_in_f32_stays_with_the_chain_in_f64_for_200_frames() {
 #[test]
 fn the_whole_solve_gives_the_same_bytes_again() {
     let scene = SmallScene::new(80, 10, 48);
-    let shots: Vec<Shot> = (0..12).map(|frame| scene.shot(f64::from(frame))).collect();
+    let shots: Vec<SceneShot> = (0..12).map(|frame| scene.shot(f64::from(frame))).collect();
     let run = |gpu: &GpuContext| {
-        let mut device = Device::new(gpu, &scene, options());
+        let mut device = TestedDeformation::new(gpu, &scene, options());
         let reports: Vec<_> = shots.iter().map(|shot| device.track(&scene, shot)).collect();
         assert!(reports.iter().flatten().map(|report| report.accepted).sum::<usize>() > 12, "{reports:?}");
         (reports, device.centers(&scene, &shots[0].poses[0]))

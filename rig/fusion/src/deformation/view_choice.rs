@@ -1,25 +1,25 @@
-//! Which views are compared, where there are more than are worth their time.
+//! Choice of the views that are compared, where there are more than are worth their time.
 
 use std::collections::BTreeMap;
 
 use flyrig_types::{Camera, CameraId};
 use glam::DVec3;
 
-/// A view that disagreed with all others is not chosen for so many frames, where there are others.
+/// Frame sets for which a view that disagreed with all others is not chosen, where there are others.
 const PATIENCE: u32 = 30;
 
-/// Keeps in mind which cameras disagreed.
+/// Chooser of views, with a memory of the cameras that disagreed.
 #[derive(Debug, Default)]
-pub struct Chooser {
-    /// Frames until the camera gets another chance.
-    doubted: BTreeMap<CameraId, u32>,
+pub struct ViewChooser {
+    /// Frame sets until the camera gets another chance.
+    distrusted: BTreeMap<CameraId, u32>,
 }
 
-impl Chooser {
-    /// At most `most` (0: all) of the cameras, those that look at `center` from directions as different as possible;
-    /// ascending. The same cameras and center give the same choice.
+impl ViewChooser {
+    /// Returns the ascending indices of at most `most` cameras (0: all), those that look at `center` from directions as different as
+    /// possible. Equal cameras and centres give equal choices.
     pub fn choose(&mut self, cameras: &[&Camera], center: DVec3, most: usize) -> Vec<usize> {
-        self.doubted.retain(|_, left| {
+        self.distrusted.retain(|_, left| {
             *left -= 1;
             *left > 0
         });
@@ -27,13 +27,13 @@ impl Chooser {
             return (0..cameras.len()).collect();
         }
         let from: Vec<DVec3> = cameras.iter().map(|c| (c.position() - center).normalize_or_zero()).collect();
-        let doubted = |i: usize| self.doubted.contains_key(&cameras[i].id);
+        let distrusted = |i: usize| self.distrusted.contains_key(&cameras[i].id);
         let mut chosen: Vec<usize> = Vec::with_capacity(most);
         while chosen.len() < most {
-            // The largest cosine to a chosen one: the less, the newer is what the view tells.
+            // The largest cosine to a chosen one: the smaller, the more the view adds.
             let known = |i: usize| chosen.iter().map(|&c| from[c].dot(from[i])).fold(-2.0, f64::max);
             let rest = (0..cameras.len()).filter(|i| !chosen.contains(i));
-            let best = rest.min_by(|&a, &b| doubted(a).cmp(&doubted(b)).then(known(a).total_cmp(&known(b))));
+            let best = rest.min_by(|&a, &b| distrusted(a).cmp(&distrusted(b)).then(known(a).total_cmp(&known(b))));
             let Some(best) = best else { break };
             chosen.push(best);
         }
@@ -41,9 +41,9 @@ impl Chooser {
         chosen
     }
 
-    /// The camera disagreed with all others.
-    pub fn doubt(&mut self, camera: &CameraId) {
-        self.doubted.insert(camera.clone(), PATIENCE);
+    /// Notes that a camera disagreed with all others.
+    pub fn distrust(&mut self, camera: &CameraId) {
+        self.distrusted.insert(camera.clone(), PATIENCE);
     }
 }
 
@@ -54,7 +54,7 @@ mod tests {
 
     use super::*;
 
-    /// On a circle around the origin at these degrees.
+    /// Returns cameras on a circle around the origin at these degrees.
     fn ring(degrees: &[f64]) -> Vec<Camera> {
         let one = |(i, deg): (usize, &f64)| {
             let at = DVec3::new(deg.to_radians().cos(), deg.to_radians().sin(), 0.0) * 3.0;
@@ -75,14 +75,14 @@ mod tests {
         degrees.iter().enumerate().map(one).collect()
     }
 
-    fn choose(chooser: &mut Chooser, cameras: &[Camera], center: DVec3, most: usize) -> Vec<usize> {
+    fn choose(chooser: &mut ViewChooser, cameras: &[Camera], center: DVec3, most: usize) -> Vec<usize> {
         chooser.choose(&cameras.iter().collect::<Vec<_>>(), center, most)
     }
 
     #[test]
     fn twins_are_left_out_and_all_sides_are_kept() {
         let cameras = ring(&[0.0, 3.0, 120.0, 121.0, 240.0, 238.0]);
-        let mut chooser = Chooser::default();
+        let mut chooser = ViewChooser::default();
         let three = choose(&mut chooser, &cameras, DVec3::ZERO, 3);
         assert_eq!(three.iter().map(|i| i / 2).collect::<Vec<_>>(), [0, 1, 2], "{three:?}");
         assert_eq!(choose(&mut chooser, &cameras, DVec3::ZERO, 3), three);
@@ -92,11 +92,11 @@ mod tests {
     }
 
     #[test]
-    fn a_doubted_camera_is_replaced_for_a_while() {
+    fn a_distrusted_camera_is_replaced_for_a_while() {
         let cameras = ring(&[0.0, 90.0, 180.0, 270.0]);
-        let mut chooser = Chooser::default();
+        let mut chooser = ViewChooser::default();
         let first = choose(&mut chooser, &cameras, DVec3::ZERO, 2);
-        chooser.doubt(&cameras[first[1]].id);
+        chooser.distrust(&cameras[first[1]].id);
         let second = choose(&mut chooser, &cameras, DVec3::ZERO, 2);
         assert!(second != first && !second.contains(&first[1]));
         for _ in 0..PATIENCE {
@@ -104,7 +104,7 @@ mod tests {
         }
         assert_eq!(choose(&mut chooser, &cameras, DVec3::ZERO, 2), first);
         // Where all are needed, it is taken all the same.
-        chooser.doubt(&cameras[0].id);
+        chooser.distrust(&cameras[0].id);
         assert_eq!(choose(&mut chooser, &cameras, DVec3::ZERO, 4), [0, 1, 2, 3]);
     }
 
@@ -112,7 +112,7 @@ mod tests {
     fn centers_that_are_no_numbers_choose_something() {
         let cameras = ring(&[0.0, 90.0, 180.0]);
         for center in [DVec3::NAN, DVec3::INFINITY, cameras[0].position()] {
-            assert_eq!(choose(&mut Chooser::default(), &cameras, center, 2).len(), 2);
+            assert_eq!(choose(&mut ViewChooser::default(), &cameras, center, 2).len(), 2);
         }
     }
 }

@@ -1,4 +1,4 @@
-//! Run times of stages, processor time and memory of the process.
+//! Run times and counts of the stages of a session.
 
 use std::{
     fmt::Write as _,
@@ -8,19 +8,33 @@ use std::{
 use flyrig_gpu::GpuTraffic;
 use serde::Serialize;
 
-use crate::stage_trace::{trace_adapter, trace_stage};
+use super::stage_trace::{trace_adapter, trace_stage};
 
-/// Run times of named stages over many frames; keeps the last 3600 samples of each.
+/// Run times of named stages over many frame sets; the last 3600 samples of each are kept.
+///
+/// # Example
+/// ```
+/// use std::time::Duration;
+///
+/// let mut stages = flyrig_fusion::StageTimes::default();
+/// let sum = stages.time("sum", || (1..=100).sum::<u32>());
+/// stages.add("wait", Duration::from_millis(3));
+/// stages.count("frame sets", 1);
+/// assert_eq!((sum, stages.summary().len()), (5050, 2));
+/// assert!((stages.total_ms("wait") - 3.0).abs() < 1e-3);
+/// ```
 #[derive(Debug, Default)]
 pub struct StageTimes {
     stages: Vec<Stage>,
     counts: Vec<(&'static str, u64)>,
 }
 
+/// Ring of one stage's samples.
 #[derive(Debug)]
 struct Stage {
     name: &'static str,
     millis: Vec<f32>,
+    /// Index of the sample that is replaced next.
     next: usize,
 }
 
@@ -29,7 +43,7 @@ struct Stage {
 pub struct StageSummary {
     /// Name of the stage; parts of a stage are indented by two spaces.
     pub name: String,
-    /// Samples.
+    /// Number of samples.
     pub frames: usize,
     /// Mean, milliseconds.
     pub mean_ms: f32,
@@ -42,10 +56,10 @@ pub struct StageSummary {
 }
 
 impl StageTimes {
-    /// Samples kept a stage: bounds the memory of a rig that runs for days.
+    /// Samples kept per stage, which bounds the memory of a rig that runs for days.
     const WINDOW: usize = 3600;
 
-    /// Adds one measurement of what has just ended.
+    /// Adds the run time of a stage that has just ended.
     pub fn add(&mut self, name: &'static str, time: Duration) {
         trace_stage(name, time);
         self.push(name, time.as_secs_f32() * 1e3);
@@ -57,7 +71,7 @@ impl StageTimes {
         self.push(name, time.as_secs_f32() * 1e3);
     }
 
-    /// Adds processor time, which is no part of a stage's run time.
+    /// Adds processor time, which is not part of a stage's run time.
     pub(crate) fn add_processor_time(&mut self, name: &'static str, time: Duration) {
         self.push(name, time.as_secs_f32() * 1e3);
     }
@@ -79,7 +93,7 @@ impl StageTimes {
         stage.next = (stage.next + 1) % Self::WINDOW;
     }
 
-    /// Measures a closure.
+    /// Runs a closure and adds its run time.
     pub fn time<T>(&mut self, name: &'static str, work: impl FnOnce() -> T) -> T {
         let start = Instant::now();
         let result = work();
@@ -97,7 +111,7 @@ impl StageTimes {
         }
     }
 
-    /// Counts dispatches, waits and bytes of the device; leaves out what is 0.
+    /// Counts dispatches, waits and bytes of the device; zeros are left out.
     pub(crate) fn count_traffic(&mut self, traffic: GpuTraffic) {
         let GpuTraffic { dispatches, waits, uploaded_bytes, read_bytes } = traffic;
         let kinds = [
@@ -119,7 +133,7 @@ impl StageTimes {
         }
     }
 
-    /// Counts of work that was done or left out so far.
+    /// Returns the counts of work that was done or left out so far.
     pub fn counts(&self) -> impl Iterator<Item = (&'static str, u64)> + '_ {
         self.counts.iter().copied()
     }
@@ -152,7 +166,7 @@ impl StageTimes {
             .collect()
     }
 
-    /// Formats a table for the terminal.
+    /// Formats the summary as a table for the terminal.
     #[must_use]
     pub fn table(&self) -> String {
         let [mean, half, most, all] = ["mean ms", "p50 ms", "p95 ms", "p99 ms"];
@@ -169,23 +183,6 @@ impl StageTimes {
         }
         text
     }
-}
-
-/// Returns the processor time of all threads of this process together: the cost of drawing where the graphics adapter is
-/// software, whatever else is running.
-#[must_use]
-pub fn processor_time() -> Duration {
-    let spent = rustix::time::clock_gettime(rustix::time::ClockId::ProcessCPUTime);
-    Duration::new(spent.tv_sec.unsigned_abs(), spent.tv_nsec.unsigned_abs().min(999_999_999) as u32)
-}
-
-/// Returns the resident memory of this process in MiB, on systems with /proc.
-#[must_use]
-pub fn resident_mib() -> Option<f64> {
-    let status = std::fs::read_to_string("/proc/self/status").ok()?;
-    let line = status.lines().find(|line| line.starts_with("VmRSS:"))?;
-    let kib: f64 = line.split_whitespace().nth(1)?.parse().ok()?;
-    Some(kib / 1024.0)
 }
 
 #[cfg(test)]
@@ -219,12 +216,5 @@ mod tests {
         sum.merge(&times);
         assert!((sum.total_ms("b") - 8.0).abs() < 1e-3 && (sum.total_ms("a") - 36_000.0).abs() < 0.5);
         assert_eq!(sum.counts().collect::<Vec<_>>(), [("views left out", 5)]);
-    }
-
-    #[test]
-    fn memory_is_plausible() {
-        if let Some(mib) = resident_mib() {
-            assert!(mib > 0.5 && mib < 1e6, "{mib}");
-        }
     }
 }

@@ -1,4 +1,4 @@
-//! When each stage ran, for a profiler's viewer. Off until a program asks for it.
+//! Trace of every stage with its thread and time, for a profiler's viewer (`--trace`). Off until a program starts it.
 
 use std::{
     collections::HashMap,
@@ -6,37 +6,38 @@ use std::{
     time::{Duration, Instant},
 };
 
-/// Events kept: an hour of a rig, and some 50 MB.
+/// Largest number of kept events: an hour of a rig, and some 50 MB.
 const MOST: usize = 500_000;
-/// Track of the times that the graphics adapter measures itself.
+/// Name of the track with times that the graphics adapter measures itself.
 const ADAPTER: &str = "adapter";
-/// Parts of a stage belong to the one before them if they are added within this time of its end.
+/// Time after the end of a stage within which parts are added to it.
 const AFTERWARDS: Duration = Duration::from_millis(2);
 
-/// One run of a stage.
+/// Run of one stage.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct TracedStage {
     /// Name of the stage.
     pub name: &'static str,
     /// Thread that ran it, or "adapter".
     pub track: String,
-    /// Since the trace was started.
+    /// Start, since the trace was started.
     pub start: Duration,
-    /// How long it took.
+    /// Run time.
     pub time: Duration,
 }
 
-/// Last stage of a track, and parts that wait for theirs.
+/// Last stage of one track, and parts that wait for their stage.
 #[derive(Debug, Default)]
 struct Track {
-    /// Where the next part of the last stage begins, and where that stage ends.
+    /// Start of the next part of the last stage.
     parts_from: Duration,
+    /// End of that stage.
     end: Duration,
     /// Parts whose stage has not been added yet.
     waiting: Vec<(&'static str, Duration)>,
 }
 
-/// Stages as they are added.
+/// Trace under way.
 #[derive(Debug)]
 struct StageTrace {
     origin: Instant,
@@ -46,13 +47,13 @@ struct StageTrace {
 
 static TRACE: Mutex<Option<StageTrace>> = Mutex::new(None);
 
-/// Starts a trace of all stages of this process, or starts it anew.
+/// Starts or restarts a trace of all stages of this process.
 pub fn start_stage_trace() {
     *lock() = Some(StageTrace::new(Instant::now()));
 }
 
-/// Ends the trace and returns its stages in the order in which they ended; nothing where none was started. After half a million of them
-/// nothing more is kept.
+/// Ends the trace and returns its stages in the order in which they ended; none where no trace was started. Half a million stages are kept
+/// at most.
 #[must_use]
 pub fn take_stage_trace() -> Vec<TracedStage> {
     lock().take().map_or_else(Vec::new, |trace| trace.stages)
@@ -67,7 +68,7 @@ pub(crate) fn trace_stage(name: &'static str, time: Duration) {
     }
 }
 
-/// Adds a time that the graphics adapter measured, known only afterwards.
+/// Adds a time that the graphics adapter measured and that is known only afterwards.
 pub(crate) fn trace_adapter(name: &'static str, time: Duration) {
     if let Some(trace) = lock().as_mut() {
         let now = Instant::now();
@@ -123,7 +124,7 @@ mod tests {
         Duration::from_millis(ms)
     }
 
-    /// Track, name, start and time in milliseconds.
+    /// Returns track, name, start and run time in milliseconds.
     fn rows(trace: &StageTrace) -> Vec<(&str, &str, u128, u128)> {
         trace.stages.iter().map(|s| (s.track.as_str(), s.name, s.start.as_millis(), s.time.as_millis())).collect()
     }

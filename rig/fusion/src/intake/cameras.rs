@@ -1,4 +1,7 @@
 //! Live frame sets: camera threads, their queue and the synchroniser.
+//!
+//! `capture::CaptureThreads` read and decode every camera into one bounded queue, which drops the oldest frame and counts it.
+//! `sync::Synchronizer` forms a [`FrameSet`] of the frames nearest to the master's time. Each frame keeps its own time.
 
 use std::{
     collections::{HashMap, VecDeque},
@@ -7,33 +10,37 @@ use std::{
 
 use flyrig_calib::WatchState;
 use flyrig_capture::{
-    CameraSource, CaptureError, CaptureThreads, Decoding, FrameStage, Pacing, PopError, SourceOpener, ThreadsConfig,
-    monotonic_nanos,
+    CameraSource, CameraStats, CaptureError, CaptureThreads, Decoding, FrameStage, Pacing, PopError, SourceOpener,
+    ThreadsConfig, monotonic_nanos,
 };
 use flyrig_sync::{ClockAligner, ClockKind, ClockState, DropCounts, SyncSettings, Synchronizer};
 use flyrig_types::{CameraId, Frame, FrameSet, Rig};
 
-use crate::{CameraHealth, FusionError, Health, health::STUCK_AFTER};
+use super::timing::Timing;
+use crate::{
+    error::FusionError,
+    health::snapshot::{CameraHealth, Health, STUCK_AFTER},
+};
 
-/// Frames a camera that may wait for the pipeline: enough to bridge a slow frame, few enough to stay live.
+/// Frames per camera that may wait for the pipeline: enough to bridge a slow frame set, few enough to stay live.
 const WAITING_FRAMES_A_CAMERA: usize = 4;
 
-/// Images that the cameras send.
+/// Format of the images that the cameras send.
 #[derive(Debug, Clone, Copy)]
 pub enum InputFormat<'a> {
-    /// RGB: there is nothing to decode.
+    /// RGB, which needs no decoding.
     Rgb,
-    /// Any format, of the calibrated sizes; others are refused.
+    /// Any format, in the calibrated sizes; others are rejected.
     OfRig(&'a Rig),
     /// Any format and size.
     AnySize,
 }
 
-/// Camera threads, their queue and the synchroniser: the source of a live session's frame sets.
+/// Source of a live session's frame sets: camera threads, their queue and the synchroniser.
 #[derive(Debug)]
 pub struct Intake {
     threads: CaptureThreads,
-    /// Only for cameras with clocks of their own.
+    /// Aligner of the cameras' own clocks, where they have any.
     aligner: Option<ClockAligner>,
     sync: Synchronizer,
     ready: VecDeque<FrameSet>,
@@ -41,39 +48,10 @@ pub struct Intake {
     every_set: bool,
     skipped_sets: u64,
     ended: bool,
-    /// By slot.
+    /// Timing of each camera, one element per slot.
     timing: Vec<Timing>,
-    /// Whether capture times are of this computer's clock.
+    /// Whether capture times are on this computer's clock.
     is_live: bool,
-}
-
-/// Means over about the last hundred frames of a camera.
-#[derive(Debug, Clone, Copy, Default)]
-struct Timing {
-    last_nanos: Option<i64>,
-    frames: f64,
-    interval_ms: f64,
-    /// Mean square of the distance from the mean interval.
-    variance: f64,
-    lateness_ms: f64,
-    arrived: Option<Instant>,
-}
-
-impl Timing {
-    const MEMORY: f64 = 100.0;
-
-    fn add(&mut self, capture_nanos: i64, now_nanos: i64) {
-        self.arrived = Some(Instant::now());
-        if let Some(last) = self.last_nanos.replace(capture_nanos) {
-            self.frames = (self.frames + 1.0).min(Self::MEMORY);
-            let interval = capture_nanos.saturating_sub(last) as f64 * 1e-6;
-            let off = interval - self.interval_ms;
-            self.interval_ms += off / self.frames;
-            self.variance += (off * off * (1.0 - 1.0 / self.frames) - self.variance) / self.frames;
-            self.lateness_ms +=
-                (now_nanos.saturating_sub(capture_nanos) as f64 * 1e-6 - self.lateness_ms) / self.frames;
-        }
-    }
 }
 
 impl Intake {
@@ -90,9 +68,9 @@ impl Intake {
         Self::start_opening(sources.into_iter().map(SourceOpener::ready).collect(), format, sync, pacing)
     }
 
-    /// Starts a thread a camera, and another one each that makes RGB of its images where they are not. With
-    /// [`Pacing::Lossless`] every set comes, in order; else the newest one wins. A live camera that cannot be opened yet
-    /// joins later; meanwhile sets come without it.
+    /// Starts one thread per camera, and another one per camera whose images need decoding. With [`Pacing::Lossless`] every frame set
+    /// comes, in order; else the newest one wins. A live camera that cannot be opened yet joins later; meanwhile frame sets come without
+    /// it.
     ///
     /// # Errors
     /// [`FusionError::Capture`] when two cameras have one name or the system gives no thread; with another pacing than
@@ -132,37 +110,11 @@ impl Intake {
         })
     }
 
-    /// The next frame set, or `None` when none came in time or all cameras have ended (see [`Self::ended`]).
+    /// Waits for the next frame set. Returns `None` when none came in time or all cameras have ended (see [`Self::ended`]).
     pub fn next_set(&mut self, timeout: Duration) -> Option<FrameSet> {
         let deadline = Instant::now() + timeout;
         loop {
-            // A live rig takes all that waits first, so that the newest set is known.
-            let every_set = self.every_set;
-            let enough = |ready: &VecDeque<FrameSet>| every_set && !ready.is_empty();
-            let mut wait = Duration::ZERO;
-            while !enough(&self.ready) && !self.ended {
-                match self.threads.queue().pop(wait) {
-                    Ok(frame) => {
-                        self.time(&frame);
-                        let frame = match &mut self.aligner {
-                            Some(aligner) => aligner.align(frame),
-                            None => frame,
-                        };
-                        self.ready.extend(self.sync.push(frame));
-                        wait = Duration::ZERO;
-                    }
-                    Err(PopError::Closed) => {
-                        self.ended = true;
-                        self.ready.extend(self.sync.flush());
-                    }
-                    Err(PopError::Timeout) => {
-                        wait = deadline.saturating_duration_since(Instant::now());
-                        if !self.ready.is_empty() || wait.is_zero() {
-                            break;
-                        }
-                    }
-                }
-            }
+            self.ingest_waiting(deadline);
             if !self.every_set && self.ready.len() > 1 {
                 self.skipped_sets += self.ready.len() as u64 - 1;
                 self.ready.drain(..self.ready.len() - 1);
@@ -173,12 +125,42 @@ impl Intake {
         }
     }
 
-    /// Declares that capture times are of this computer's clock, so that latency is measured.
+    /// Ingests frames until a frame set is ready or the deadline has passed. A live rig ingests all waiting frames, so that the newest frame
+    /// set is known.
+    fn ingest_waiting(&mut self, deadline: Instant) {
+        let mut wait = Duration::ZERO;
+        while !(self.ended || self.every_set && !self.ready.is_empty()) {
+            match self.threads.queue().pop(wait) {
+                Ok(frame) => {
+                    self.time(&frame);
+                    let frame = match &mut self.aligner {
+                        Some(aligner) => aligner.align(frame),
+                        None => frame,
+                    };
+                    self.ready.extend(self.sync.push(frame));
+                    wait = Duration::ZERO;
+                }
+                Err(PopError::Closed) => {
+                    self.ended = true;
+                    self.ready.extend(self.sync.flush());
+                }
+                Err(PopError::Timeout) => {
+                    wait = deadline.saturating_duration_since(Instant::now());
+                    if !self.ready.is_empty() || wait.is_zero() {
+                        break;
+                    }
+                }
+            }
+        }
+    }
+
+    /// Declares that capture times are on this computer's clock, so that latency is measured.
     #[must_use]
     pub fn live(self) -> Self {
         Self { is_live: true, ..self }
     }
 
+    /// Updates the timing of a frame's camera.
     fn time(&mut self, frame: &Frame) {
         self.timing.resize(self.cameras.len(), Timing::default());
         if let Some(slot) = self.cameras.iter().position(|camera| *camera == frame.camera) {
@@ -186,13 +168,13 @@ impl Intake {
         }
     }
 
-    /// The last error of a camera.
+    /// Returns the last error of a camera.
     #[must_use]
     pub fn last_error(&self, slot: usize) -> Option<CaptureError> {
         self.threads.stats().into_iter().nth(slot).and_then(|stats| stats.last_error)
     }
 
-    /// Reports the health of the cameras and sets; stages and memory are left empty.
+    /// Reports the health of cameras and frame sets; stages and memory are left empty.
     #[must_use]
     pub fn health(&self) -> Health {
         let counts = self.sync.counts();
@@ -225,13 +207,13 @@ impl Intake {
         }
     }
 
-    /// Whether every camera has ended and every set was taken.
+    /// Returns whether every camera has ended and every frame set was taken.
     #[must_use]
     pub fn ended(&self) -> bool {
         self.ended && self.ready.is_empty()
     }
 
-    /// Counts the frames and sets that were lost before the session, by place.
+    /// Counts the frames and frame sets that were lost before the session, by place.
     #[must_use]
     pub fn drops(&self) -> Vec<(String, u64)> {
         let counts = self.sync.counts();
@@ -241,44 +223,29 @@ impl Intake {
         ];
         let in_no_set = self.cameras.iter().zip(&counts.dropped_frames);
         drops.extend(in_no_set.map(|(camera, dropped)| (format!("frames of {camera} in no set"), dropped.total())));
-        for camera in self.threads.stats() {
-            drops.push((format!("frames of {} waiting too long", camera.camera), camera.dropped));
-            drops.push((format!("frames of {} overtaken before their decoding", camera.camera), camera.overtaken));
-            if let Some(network) = camera.health.network {
-                for (place, count) in [
-                    ("left on the camera's computer", network.overtaken_before),
-                    ("lost on the way", network.lost_on_the_way),
-                    ("overtaken when they had come", network.overtaken_here),
-                    ("refused", network.refused),
-                    ("before its clock was known", network.before_clock),
-                ] {
-                    drops.push((format!("frames of {} {place}", camera.camera), count));
-                }
-            }
-            drops.push((format!("errors of {}", camera.camera), camera.errors.values().sum()));
-            drops.push((format!("frames of {} lost before us", camera.camera), camera.health.lost_by_driver));
-        }
+        drops.extend(self.threads.stats().iter().flat_map(camera_drops));
         drops
     }
 }
 
-#[cfg(test)]
-mod tests {
-    use super::*;
-
-    #[test]
-    fn intervals_jitter_and_lateness_are_means() {
-        let mut timing = Timing::default();
-        for n in 0..1000i64 {
-            let capture = n * 33_000_000 + if n % 2 == 0 { 1_000_000 } else { 0 };
-            timing.add(capture, capture + 7_000_000);
+/// Counts the frames of one camera that were lost, by place.
+fn camera_drops(camera: &CameraStats) -> Vec<(String, u64)> {
+    let mut drops = vec![
+        (format!("frames of {} waiting too long", camera.camera), camera.dropped),
+        (format!("frames of {} overtaken before their decoding", camera.camera), camera.overtaken),
+    ];
+    if let Some(network) = camera.health.network {
+        for (place, count) in [
+            ("left on the camera's computer", network.overtaken_before),
+            ("lost on the way", network.lost_on_the_way),
+            ("overtaken when they had come", network.overtaken_here),
+            ("refused", network.refused),
+            ("before its clock was known", network.before_clock),
+        ] {
+            drops.push((format!("frames of {} {place}", camera.camera), count));
         }
-        assert!((timing.interval_ms - 33.0).abs() < 0.1, "{timing:?}");
-        // Intervals are 32 and 34 in turn.
-        assert!((timing.variance.sqrt() - 1.0).abs() < 0.1, "{timing:?}");
-        assert!((timing.lateness_ms - 7.0).abs() < 1e-6, "{timing:?}");
-        timing.add(i64::MIN, i64::MAX);
-        timing.add(i64::MAX, i64::MIN);
-        assert!(timing.variance.is_finite());
     }
+    drops.push((format!("errors of {}", camera.camera), camera.errors.values().sum()));
+    drops.push((format!("frames of {} lost before us", camera.camera), camera.health.lost_by_driver));
+    drops
 }

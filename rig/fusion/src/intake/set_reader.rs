@@ -1,4 +1,4 @@
-//! Frame sets of recordings, read in step and without loss.
+//! Frame sets of recordings, read in step and without loss. `flyrig eval` uses them.
 
 use std::{collections::VecDeque, time::Duration};
 
@@ -6,13 +6,32 @@ use flyrig_capture::{CameraSource, CaptureError, CaptureErrorKind};
 use flyrig_sync::{SyncCounts, SyncSettings, Synchronizer};
 use flyrig_types::{CameraId, Frame, FrameSet};
 
-/// Reads recorded cameras in the order of time, so that one that began late or lost frames keeps in step, and forms sets; a damaged image
-/// is missing from its set.
+/// Reader of recorded cameras, which forms frame sets.
+///
+/// Frames are read in the order of time, so that a camera that began late or lost frames keeps in step. A damaged image is missing from its
+/// frame set.
+///
+/// # Example
+/// ```no_run
+/// use flyrig_fusion::{
+///     SetReader,
+///     capture::{CameraSource, FolderOptions, FolderReplay},
+///     sync::SyncSettings,
+/// };
+///
+/// let replay = FolderReplay::open("take".as_ref(), None, &FolderOptions::default())?;
+/// let sources = replay.into_iter().map(|source| Box::new(source) as Box<dyn CameraSource>).collect();
+/// let mut sets = SetReader::new(sources, &SyncSettings::default());
+/// while let Some(set) = sets.next_set()? {
+///     println!("frame set {}: {} images", set.index, set.present().count());
+/// }
+/// # Ok::<(), Box<dyn std::error::Error>>(())
+/// ```
 pub struct SetReader {
     sources: Vec<Box<dyn CameraSource>>,
-    /// Next frame of each source, and its place in the order of time, nanoseconds.
+    /// Next frame of each source with its position in the order of time, nanoseconds.
     ahead: Vec<Option<(i64, Frame)>>,
-    /// Sources that have ended.
+    /// Whether each source has ended.
     ended: Vec<bool>,
     sync: Synchronizer,
     ready: VecDeque<FrameSet>,
@@ -21,7 +40,7 @@ pub struct SetReader {
 }
 
 impl SetReader {
-    /// Reads these sources, one slot each.
+    /// Reads these sources, one per slot.
     #[must_use]
     pub fn new(sources: Vec<Box<dyn CameraSource>>, sync: &SyncSettings) -> Self {
         let ids: Vec<CameraId> = sources.iter().map(|source| source.camera().clone()).collect();
@@ -36,10 +55,10 @@ impl SetReader {
         }
     }
 
-    /// Returns the next set; `None` at the end of all sources.
+    /// Returns the next frame set; `None` at the end of all sources.
     ///
     /// # Errors
-    /// The source's, but for damaged images, which are logged and counted.
+    /// As the sources, except for damaged images, which are logged and counted.
     pub fn next_set(&mut self) -> Result<Option<FrameSet>, CaptureError> {
         while self.ready.is_empty() && !self.done {
             for slot in 0..self.sources.len() {
@@ -74,13 +93,13 @@ impl SetReader {
         Ok(())
     }
 
-    /// Counts of the synchroniser.
+    /// Returns the counts of the synchroniser.
     #[must_use]
     pub fn counts(&self) -> SyncCounts {
         self.sync.counts().clone()
     }
 
-    /// Number of damaged images.
+    /// Returns the number of damaged images.
     #[must_use]
     pub fn damaged(&self) -> u64 {
         self.damaged
@@ -90,7 +109,7 @@ impl SetReader {
 /// Returns the next frame of a recording; `None` at its end.
 ///
 /// # Errors
-/// The source's.
+/// As [`CameraSource::next_frame`].
 pub fn next_frame(source: &mut dyn CameraSource) -> Result<Option<Frame>, CaptureError> {
     match source.next_frame(Duration::ZERO) {
         Ok(frame) => Ok(Some(frame)),
@@ -138,7 +157,7 @@ mod tests {
         }
     }
 
-    /// Times at 30 a second, `off` milliseconds late.
+    /// Returns capture times at 30 per second, `off` milliseconds late.
     fn frames(range: std::ops::Range<i64>, off: i64) -> Vec<Result<i64, CaptureErrorKind>> {
         range.map(|i| Ok(i * 33_333_333 + off * 1_000_000)).collect()
     }

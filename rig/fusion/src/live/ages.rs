@@ -1,4 +1,4 @@
-//! How old a set is when it has been published, by the rig's own clock.
+//! Age of a frame set when it has been published, by the rig's own clock.
 
 use std::time::{Duration, Instant};
 
@@ -7,14 +7,14 @@ use flyrig_capture::monotonic_nanos;
 /// Name of the age among the stages.
 pub(crate) const AGE: &str = "age when published";
 
-/// Compares the cameras' clock with the rig's: the set that came soonest after its capture counts as 0 old when it came. What every set
-/// takes at least from the lens to here (exposure, transfer, decoding, joining) is therefore not in an age.
+/// Comparison of the cameras' clock with the rig's. The frame set that came soonest after its capture has age 0 at its arrival, so that an
+/// age leaves out the least latency from the lens to here (exposure, transfer, decoding, joining).
 #[derive(Debug)]
 pub(crate) struct Ages {
     started: Instant,
-    /// `CLOCK_MONOTONIC` then.
+    /// `CLOCK_MONOTONIC` at `started`, nanoseconds.
     started_nanos: i64,
-    /// Least nanoseconds from a set's time to its arrival since the start; `None` before the first set.
+    /// Least difference between a frame set's arrival, since the start, and its time, nanoseconds; `None` before the first.
     soonest: Option<i64>,
 }
 
@@ -23,23 +23,24 @@ impl Ages {
         Self { started: Instant::now(), started_nanos: monotonic_nanos(), soonest: None }
     }
 
-    /// A set of this time has come.
+    /// Notes the arrival of a frame set with this time.
     pub fn arrived(&mut self, master_nanos: i64) {
         let after = self.after(master_nanos);
         self.soonest = Some(self.soonest.map_or(after, |soonest| soonest.min(after)));
     }
 
-    /// Age of a set now; `None` before any has come.
+    /// Returns the current age of a frame set; `None` before the first arrival.
     pub fn of(&self, master_nanos: i64) -> Option<Duration> {
         let age = self.after(master_nanos).saturating_sub(self.soonest?);
         Some(Duration::from_nanos(u64::try_from(age).unwrap_or(0)))
     }
 
-    /// `CLOCK_MONOTONIC` minus the cameras' clock, nanoseconds, by the set that came soonest; `None` before any has come.
+    /// Returns `CLOCK_MONOTONIC` minus the cameras' clock, nanoseconds, from the frame set that came soonest; `None` before the first arrival.
     pub fn clock_offset_nanos(&self) -> Option<i64> {
         self.soonest.map(|soonest| self.started_nanos.saturating_add(soonest))
     }
 
+    /// Returns the time since the start minus a frame set's time, nanoseconds.
     fn after(&self, master_nanos: i64) -> i64 {
         let elapsed = i64::try_from(self.started.elapsed().as_nanos()).unwrap_or(i64::MAX);
         elapsed.saturating_sub(master_nanos)

@@ -1,4 +1,4 @@
-//! Watches the cameras of a live rig for bumps.
+//! Watch over the cameras of a live rig: bumps are reported, and corrected with `watch = "correct"`.
 
 use std::fmt;
 
@@ -6,53 +6,56 @@ use flyrig_calib::{CameraWatch, WatchState, WatchedImage};
 use flyrig_types::{Camera, CameraId, FrameSet, Image, Intrinsics, PixelFormat, Rig};
 use glam::{DVec2, DVec3};
 
-/// Time between two looks at a camera, nanoseconds.
+/// Time between two checks of a camera, nanoseconds.
 const EVERY_NANOS: i64 = 1_000_000_000;
-/// A corrected camera is corrected again when it turns by so many pixels, and by this share of its turn.
+/// Least further turn at which a corrected camera is corrected again, pixels.
 const NEWS_PX: f64 = 1.0;
+/// Least further turn at which it is corrected again, as a share of its turn.
 const NEWS_SHARE: f64 = 0.1;
 
-/// Compares one camera of a set at a time with its reference: the plate, or the first image where there is none.
+/// Comparison of one camera per frame set with its reference: the plate, or the first image where there is none.
 #[derive(Debug)]
 pub struct RigWatch {
-    /// By slot.
-    cameras: Vec<Watched>,
+    /// Cameras, one element per slot.
+    cameras: Vec<WatchedCamera>,
+    /// Whether moved cameras are corrected.
     corrects: bool,
 }
 
+/// One camera with its reference.
 #[derive(Debug)]
-struct Watched {
-    /// As it was calibrated.
+struct WatchedCamera {
+    /// Camera as it was calibrated.
     camera: Camera,
-    /// Kept where moves are corrected.
+    /// Plate, kept where moves are corrected.
     plate: Option<Image>,
     /// Rotation vector that the last correction applied, radians.
     corrected: Option<DVec3>,
     watch: Option<CameraWatch>,
-    looked_nanos: Option<i64>,
+    checked_nanos: Option<i64>,
 }
 
-/// A camera was moved, or stands again where it stood.
+/// Event of a camera that was moved, or that stands again where it stood.
 #[derive(Debug)]
 pub struct WatchEvent {
-    /// Which camera.
+    /// Id of the camera.
     pub camera: CameraId,
     /// New state.
     pub state: WatchState,
     /// Capture time of the image that decided, nanoseconds.
     pub nanos: i64,
-    /// The camera as the session goes on with it, where moves are corrected.
+    /// Camera with which the session goes on; `None` where moves are not corrected.
     pub corrected: Option<Correction>,
 }
 
-/// Where a camera stands now.
+/// Corrected position of a camera.
 #[derive(Debug)]
 pub struct Correction {
     /// Slot of the camera in the rig.
     pub slot: usize,
-    /// The calibrated camera, turned as its background says.
+    /// Calibrated camera, turned as its background was.
     pub camera: Camera,
-    /// The empty scene as it sees it now, where there was a plate.
+    /// Empty scene as the camera sees it now; `None` without a plate.
     pub plate: Option<Image>,
 }
 
@@ -86,17 +89,17 @@ impl RigWatch {
     /// Takes the plates of a rig, by slot, as references.
     #[must_use]
     pub fn new(rig: &Rig, plates: &[Option<Image>]) -> Self {
-        let watched = |(slot, camera): (usize, &Camera)| Watched {
+        let watched = |(slot, camera): (usize, &Camera)| WatchedCamera {
             camera: camera.clone(),
             plate: None,
             corrected: None,
             watch: plates.get(slot).and_then(Option::as_ref).and_then(|plate| watch(&camera.intrinsics, plate)),
-            looked_nanos: None,
+            checked_nanos: None,
         };
         Self { cameras: rig.cameras.iter().enumerate().map(watched).collect(), corrects: false }
     }
 
-    /// Corrects cameras that were moved: events say where they stand. `plates`, by slot, are turned along.
+    /// Corrects cameras that were moved: events hold their new positions. `plates`, one per slot, are turned along.
     #[must_use]
     pub fn correcting(mut self, plates: Vec<Option<Image>>) -> Self {
         self.corrects = true;
@@ -104,16 +107,16 @@ impl RigWatch {
         self
     }
 
-    /// Looks at the camera that was not looked at for longest, if that is a second ago.
-    pub fn look(&mut self, set: &FrameSet) -> Option<WatchEvent> {
+    /// Checks the camera whose last check is longest ago, if that is a second or more.
+    pub fn check(&mut self, set: &FrameSet) -> Option<WatchEvent> {
         let due = self.cameras.iter_mut().zip(&set.frames).enumerate();
         let due = due.filter_map(|(slot, (camera, frame))| Some((slot, camera, frame.as_ref()?)));
-        let (slot, watched, frame) = due.min_by_key(|(_, camera, _)| camera.looked_nanos)?;
+        let (slot, watched, frame) = due.min_by_key(|(_, camera, _)| camera.checked_nanos)?;
         let nanos = frame.capture_nanos;
-        if watched.looked_nanos.is_some_and(|last| nanos.saturating_sub(last) < EVERY_NANOS) {
+        if watched.checked_nanos.is_some_and(|last| nanos.saturating_sub(last) < EVERY_NANOS) {
             return None;
         }
-        watched.looked_nanos = Some(nanos);
+        watched.checked_nanos = Some(nanos);
         let Some(known) = &mut watched.watch else {
             watched.watch = watch(&watched.camera.intrinsics, &frame.image);
             return None;
@@ -126,7 +129,7 @@ impl RigWatch {
         is_news.then(|| WatchEvent { camera: watched.camera.id.clone(), state, nanos, corrected })
     }
 
-    /// State of a camera.
+    /// Returns the state of a camera.
     #[must_use]
     pub fn state(&self, slot: usize) -> WatchState {
         let watch = self.cameras.get(slot).and_then(|camera| camera.watch.as_ref());
@@ -134,8 +137,8 @@ impl RigWatch {
     }
 }
 
-impl Watched {
-    /// Returns where the camera stands, if that is news.
+impl WatchedCamera {
+    /// Returns the camera's correction, if it has changed noticeably.
     fn correction(&mut self, slot: usize, state: WatchState) -> Option<Correction> {
         let turned = match state {
             WatchState::Moved(motion) => Some(motion.rotation),
@@ -161,8 +164,8 @@ impl Watched {
     }
 }
 
-/// The empty scene as a camera sees it after it was turned on the spot; pixels that it did not see before have the colour of the nearest
-/// one that it saw. `None` for formats other than [`as_watched`]'s.
+/// Renders the empty scene as a camera sees it after it was turned on the spot. Pixels that it did not see before get the colour of the
+/// nearest one that it saw. `None` for formats that [`as_watched`] rejects.
 fn turned_plate(plate: &Image, from: &Camera, to: &Camera) -> Option<Image> {
     let WatchedImage { width, height, channels, bytes } = as_watched(plate)?;
     if [width as u32, height as u32] != from.size() {
@@ -187,11 +190,12 @@ fn turned_plate(plate: &Image, from: &Camera, to: &Camera) -> Option<Image> {
     Image::new(plate.width(), plate.height(), plate.format(), bytes).ok()
 }
 
+/// Creates the watch of a camera; `None` for a reference that cannot be used.
 fn watch(intrinsics: &Intrinsics, reference: &Image) -> Option<CameraWatch> {
     CameraWatch::new(intrinsics, &as_watched(reference)?)
 }
 
-/// Views an image as bytes; `None` for formats that a session does not take either.
+/// Views an image as bytes; `None` for formats that a session rejects too.
 fn as_watched(image: &Image) -> Option<WatchedImage<'_>> {
     let channels = match image.format() {
         PixelFormat::Rgb8 => 3,
@@ -212,7 +216,7 @@ mod tests {
 
     const SIZE: (u32, u32) = (320, 240);
 
-    /// Blocks of random brightness, shifted to the right.
+    /// Returns blocks of random brightness, shifted to the right.
     fn image(shift: u32, gain: f64) -> Image {
         let block = |x: u32, y: u32| {
             let (bx, by) = ((x + 1000 - shift) / 16, y / 16);
@@ -268,7 +272,7 @@ mod tests {
             for index in 0..120 {
                 let shift = if (40..80).contains(&index) { 5 } else { 0 };
                 let right = (index % 7 != 3).then(|| image(shift, 0.9));
-                events.extend(watch.look(&set(&rig, index, [Some(image(0, 1.0)), right])));
+                events.extend(watch.check(&set(&rig, index, [Some(image(0, 1.0)), right])));
             }
             let texts: Vec<String> = events.iter().map(WatchEvent::to_string).collect();
             assert_eq!(events.len(), 2, "{texts:?}");
@@ -289,7 +293,7 @@ mod tests {
         for index in 0..200 {
             // Turned, turned further, put back.
             let shift = [0, 5, 12, 0][(index / 40).min(3) as usize];
-            events.extend(watch.look(&set(&rig, index, [Some(image(0, 1.0)), Some(image(shift, 0.9))])));
+            events.extend(watch.check(&set(&rig, index, [Some(image(0, 1.0)), Some(image(shift, 0.9))])));
         }
         let texts: Vec<String> = events.iter().map(WatchEvent::to_string).collect();
         assert_eq!(events.len(), 3, "{texts:?}");
@@ -316,8 +320,8 @@ mod tests {
         let small = || Image::new(8, 8, PixelFormat::Rgb8, vec![9; 192]).unwrap();
         let packed = || Image::new(SIZE.0, SIZE.1, PixelFormat::Yuyv, vec![9; (2 * SIZE.0 * SIZE.1) as usize]).unwrap();
         for index in 0..40 {
-            assert!(watch.look(&set(&rig, index, [None, None])).is_none());
-            assert!(watch.look(&set(&rig, index, [Some(small()), Some(packed())])).is_none());
+            assert!(watch.check(&set(&rig, index, [None, None])).is_none());
+            assert!(watch.check(&set(&rig, index, [Some(small()), Some(packed())])).is_none());
         }
         assert_eq!(watch.state(0), WatchState::Unknown);
     }

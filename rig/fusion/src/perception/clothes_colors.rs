@@ -1,25 +1,25 @@
-//! Colour histograms of clothes, which distinguish people.
+//! Colour histograms of clothes, which distinguish people who come back.
 
 use flyrig_capture::to_rgb8;
 use flyrig_types::{FrameSet, Mask};
 
 /// Bins of each colour channel.
 const BINS: usize = 4;
-/// Bins of the upper half of the body, then of the lower one.
+/// Number of bins: those of the upper half of the body, then those of the lower.
 const COUNT: usize = 2 * BINS * BINS * BINS;
-/// Rows and columns from one sample to the next.
+/// Pixels from one sample to the next, along rows and columns.
 const STEP: usize = 3;
-/// Coverage from which a pixel is the person's own.
+/// Least coverage at which a pixel is the person's own.
 const INSIDE: u8 = 250;
 
-/// Shares of colours in the upper and the lower half of a person, over all views of a set.
+/// Shares of colours in the upper and the lower half of a person, over all views of a frame set.
 #[derive(Debug, Clone, PartialEq)]
 pub(super) struct ClothesColors {
     shares: [f64; COUNT],
 }
 
 impl ClothesColors {
-    /// Samples the pixels inside of a person's masks, by slot; `None` without any.
+    /// Samples the pixels inside of a person's masks, one per slot; `None` without any.
     pub fn of(set: &FrameSet, masks: &[Option<&Mask>]) -> Option<Self> {
         let mut shares = [0.0; COUNT];
         for (slot, frame) in set.present() {
@@ -51,7 +51,7 @@ impl ClothesColors {
         Some(Self { shares })
     }
 
-    /// Share of the colours that both have, 0..=1.
+    /// Returns the share of the colours that both have, 0..=1.
     pub fn likeness(&self, other: &Self) -> f64 {
         self.shares.iter().zip(&other.shares).map(|(a, b)| a.min(*b)).sum()
     }
@@ -67,7 +67,7 @@ mod tests {
 
     const SIDE: u32 = 24;
 
-    /// A set of one camera that sees trousers of one colour under a shirt of another.
+    /// Returns a frame set of one camera that sees trousers of one colour under a shirt of another.
     fn set(shirt: [u8; 3], trousers: [u8; 3]) -> FrameSet {
         let bytes = (0..SIDE).flat_map(|y| (0..SIDE).flat_map(move |_| if y < SIDE / 2 { shirt } else { trousers }));
         let image = Image::new(SIDE, SIDE, PixelFormat::Rgb8, bytes.collect::<Vec<_>>()).unwrap();

@@ -1,17 +1,21 @@
-//! The search for clothes on a person whose shape is given.
+//! Search for shoes and a skirt on a person whose shape is given.
+//!
+//! Joints stay those of the body: the session draws it dressed, and outlines are those of the feet in shoes.
 
 use flyrig_body::{Outfit, Template};
 use flyrig_tracker::{MaskedPoses, MaskedView, find_outfit};
 use flyrig_types::{Camera, FrameSet, Mask, PersonId, Pose};
 
-use super::SeenPerson;
-use crate::{SHAPE_SECS, SHAPE_SETS};
+use super::{
+    observation::SeenPerson,
+    sampling::{SHAPE_EVERY_NANOS, SHAPE_SETS},
+};
 
-/// Collects poses and masks of a person, as many as a shape takes, and looks for clothes once.
+/// Collector of a person's poses and masks, which looks for clothes once there are as many as for a shape.
 #[derive(Debug, Clone, Default)]
 pub(crate) struct OutfitSearch {
     poses: Vec<Pose>,
-    /// Which pose, which slot.
+    /// Index of the pose, slot of the camera, and mask.
     masks: Vec<(usize, usize, Mask)>,
     last_nanos: Option<i64>,
     is_over: bool,
@@ -20,7 +24,7 @@ pub(crate) struct OutfitSearch {
 }
 
 impl OutfitSearch {
-    /// Returns a search that is over, for a template that wears its clothes already.
+    /// Returns a search that is over, for a template that is dressed already.
     pub fn over() -> Self {
         Self { is_over: true, ..Self::default() }
     }
@@ -30,7 +34,7 @@ impl OutfitSearch {
         self.outfit
     }
 
-    /// Returns the body in these clothes; `None` while it is bare.
+    /// Returns the dressed body; `None` while it is bare.
     pub fn dressed(&self) -> Option<&Template> {
         self.dressed.as_ref()
     }
@@ -40,10 +44,9 @@ impl OutfitSearch {
         self.is_over
     }
 
-    /// Takes in a set of a running session, and looks for clothes once enough time has passed.
-    pub fn take(&mut self, set: &FrameSet, seen: &SeenPerson, body: &Template, cameras: &[Camera]) {
-        let every_nanos = (SHAPE_SECS * 1e9 / SHAPE_SETS as f64) as i64;
-        let is_soon = self.last_nanos.is_some_and(|last| set.master_nanos.saturating_sub(last) < every_nanos);
+    /// Ingests a frame set of a running session, and looks for clothes once enough time has passed.
+    pub fn ingest(&mut self, set: &FrameSet, seen: &SeenPerson, body: &Template, cameras: &[Camera]) {
+        let is_soon = self.last_nanos.is_some_and(|last| set.master_nanos.saturating_sub(last) < SHAPE_EVERY_NANOS);
         if self.is_over || is_soon {
             return;
         }
@@ -54,17 +57,17 @@ impl OutfitSearch {
         }
     }
 
-    /// Keeps the pose and masks of a set.
+    /// Keeps the pose and masks of a frame set.
     pub fn add(&mut self, set: &FrameSet, seen: &SeenPerson) {
         for ((slot, _), view) in set.present().zip(&seen.views) {
-            // Where somebody else hides a part, the mask says nothing of clothes.
+            // Where another person hides a part, the mask is not informative for clothes.
             let own = view.mask.as_ref().filter(|_| view.others.is_none());
             self.masks.extend(own.map(|mask| (self.poses.len(), slot, mask.clone())));
         }
         self.poses.push(seen.pose.clone());
     }
 
-    /// Looks for clothes in the sets so far. Later sets change nothing.
+    /// Looks for clothes in the frame sets so far. Later ones change nothing.
     pub fn finish(&mut self, person: PersonId, body: &Template, cameras: &[Camera]) {
         let (poses, masks) = (std::mem::take(&mut self.poses), std::mem::take(&mut self.masks));
         let views = masks

@@ -1,4 +1,6 @@
-//! From rendered views to the network: compression and publishing off the session's thread.
+//! Compression and publishing of views, Gaussians and statistics beside the session's thread.
+//!
+//! A thread named "encode" compresses views; a full queue drops its oldest view and counts it.
 
 use std::{
     error::Error,
@@ -17,28 +19,31 @@ use flyrig_transport::{
 use flyrig_types::{FrameSet, RenderedView, SupervisedThread, ThreadHealth};
 use image::{ExtendedColorType, ImageEncoder as _, codecs::jpeg::JpegEncoder};
 
-use crate::{FusionError, Session, Subject, person_stream::PersonPublisher};
+use super::person_publisher::PersonPublisher;
+use crate::{error::FusionError, session::Session, subject::Subject};
 
-/// Views that may wait for compression, all together.
+/// Capacity of the queue before compression, in views.
 const WAITING_PICTURES: usize = 8;
 /// Grey behind the people in published views, sRGB.
 const BACKDROP: u8 = 30;
-/// How often statistics are published.
+/// Time from one publishing of statistics to the next.
 const STATS_EVERY: Duration = Duration::from_secs(1);
 
-struct Job {
+/// View to compress and publish.
+struct ViewJob {
     view: String,
     picture: RenderedView,
     frame: u64,
     capture_nanos: i64,
 }
 
-/// Compresses and publishes views, Gaussians and statistics without ever making the session wait.
+/// Publisher of views, Gaussians, people and statistics, for which the session never waits.
 pub struct LivePublisher {
     publisher: Arc<Publisher>,
-    jobs: Arc<LatestQueue<Job>>,
+    jobs: Arc<LatestQueue<ViewJob>>,
     encoder: SupervisedThread,
     people: PersonPublisher,
+    /// Views that could not be compressed or published.
     failures: Arc<AtomicU64>,
     started: Instant,
     last_stats: Instant,
@@ -56,7 +61,7 @@ impl LivePublisher {
 
     fn start_with(
         publisher: Publisher,
-        encode: impl Fn(&Publisher, &Job) -> Result<(), Box<dyn Error>> + Send + 'static,
+        encode: impl Fn(&Publisher, &ViewJob) -> Result<(), Box<dyn Error>> + Send + 'static,
     ) -> Result<Self, FusionError> {
         let publisher = Arc::new(publisher);
         let jobs = Arc::new(LatestQueue::new(WAITING_PICTURES));
@@ -65,7 +70,7 @@ impl LivePublisher {
             let (publisher, jobs, failures) = (Arc::clone(&publisher), Arc::clone(&jobs), Arc::clone(&failures));
             let mut has_begun = false;
             let work = move || {
-                // Begun anew: the view that it panicked at is lost.
+                // A restart: the view at which it panicked is lost.
                 if std::mem::replace(&mut has_begun, true) {
                     failures.fetch_add(1, Ordering::Relaxed);
                 }
@@ -86,19 +91,19 @@ impl LivePublisher {
         })
     }
 
-    /// The publisher, to ask who watches.
+    /// Returns the transport's publisher, which knows the subscriptions.
     #[must_use]
     pub fn publisher(&self) -> &Publisher {
         &self.publisher
     }
 
-    /// Hands a rendered view over; when the compressor is behind, the oldest waiting view is dropped and counted.
+    /// Queues a rendered view. When compression is behind, the oldest waiting view is dropped and counted.
     pub fn publish(&self, view: &str, picture: RenderedView, set: &FrameSet) {
-        let job = Job { view: view.to_owned(), picture, frame: set.index, capture_nanos: set.master_nanos };
+        let job = ViewJob { view: view.to_owned(), picture, frame: set.index, capture_nanos: set.master_nanos };
         drop(self.jobs.push(job));
     }
 
-    /// Reads everybody's Gaussians back and hands them over.
+    /// Reads back the Gaussians of all people and queues them.
     ///
     /// # Errors
     /// [`FusionError::Gpu`].
@@ -121,7 +126,7 @@ impl LivePublisher {
         Ok(())
     }
 
-    /// Reads everybody's colours back and hands them over with the motion.
+    /// Reads back the colours of all people and queues them with the motion.
     ///
     /// # Errors
     /// [`FusionError::Gpu`].
@@ -134,7 +139,7 @@ impl LivePublisher {
         Ok(())
     }
 
-    /// Publishes statistics once a second; returns whether it did. For `clock_offset_nanos` see [`RigStats`].
+    /// Publishes statistics, once per second; returns whether it did. For `clock_offset_nanos` see [`RigStats`].
     pub fn publish_stats(
         &mut self,
         session: &Session,
@@ -150,6 +155,22 @@ impl LivePublisher {
         let frames_per_second = (frames - self.frames_at_last_stats.min(frames)) as f64 / interval.as_secs_f64();
         self.last_stats = Instant::now();
         self.frames_at_last_stats = frames;
+        let stats = self.stats(session, set, frames_per_second, clock_offset_nanos, drops);
+        if let Err(error) = self.publisher.publish_stats(&stats) {
+            tracing::warn!(%error, "statistics not published");
+        }
+        true
+    }
+
+    /// Collects the statistics of the rig.
+    fn stats(
+        &self,
+        session: &Session,
+        set: &FrameSet,
+        frames_per_second: f64,
+        clock_offset_nanos: Option<i64>,
+        drops: &[(String, u64)],
+    ) -> RigStats {
         let uptime_secs = self.started.elapsed().as_secs_f64();
         let counts = self.publisher.counts();
         let views = counts
@@ -162,7 +183,7 @@ impl LivePublisher {
                 })
             })
             .collect();
-        let stats = RigStats {
+        RigStats {
             frame: set.index,
             capture_nanos: set.master_nanos,
             clock_offset_nanos,
@@ -184,11 +205,7 @@ impl LivePublisher {
             budget: session.budget.stats(),
             tracking: TrackingStats::default(),
             subjects: session.subjects().iter().map(stats_of).collect(),
-        };
-        if let Err(error) = self.publisher.publish_stats(&stats) {
-            tracing::warn!(%error, "statistics not published");
         }
-        true
     }
 
     /// Returns the health of the threads that compress and publish.
@@ -197,7 +214,7 @@ impl LivePublisher {
         [self.encoder.health(), self.people.health(), self.publisher.thread()]
     }
 
-    /// Counts the views lost on the way out, by place.
+    /// Counts the views that were lost on the way out, by place.
     #[must_use]
     pub fn drops(&self) -> Vec<(String, u64)> {
         let mut drops = vec![
@@ -209,7 +226,7 @@ impl LivePublisher {
         drops
     }
 
-    /// Sends what waits and ends the thread and the transport session.
+    /// Publishes what waits, and ends the threads and the transport session.
     ///
     /// # Errors
     /// [`FusionError::Transport`].
@@ -224,6 +241,7 @@ impl LivePublisher {
     }
 }
 
+/// Returns the tracking statistics of one person.
 fn stats_of(subject: &Subject) -> SubjectStats {
     let watch = subject.watch();
     SubjectStats {
@@ -234,7 +252,12 @@ fn stats_of(subject: &Subject) -> SubjectStats {
     }
 }
 
-fn encode_all(jobs: &LatestQueue<Job>, failures: &AtomicU64, encode: impl Fn(&Job) -> Result<(), Box<dyn Error>>) {
+/// Compresses and publishes views until the queue is closed.
+fn encode_all(
+    jobs: &LatestQueue<ViewJob>,
+    failures: &AtomicU64,
+    encode: impl Fn(&ViewJob) -> Result<(), Box<dyn Error>>,
+) {
     loop {
         let job = match jobs.pop(Duration::from_millis(200)) {
             Ok(job) => job,
@@ -248,7 +271,8 @@ fn encode_all(jobs: &LatestQueue<Job>, failures: &AtomicU64, encode: impl Fn(&Jo
     }
 }
 
-fn encode_one(publisher: &Publisher, job: &Job, quality: u8) -> Result<(), Box<dyn Error>> {
+/// Compresses one view over the backdrop, and publishes it as JPEG.
+fn encode_one(publisher: &Publisher, job: &ViewJob, quality: u8) -> Result<(), Box<dyn Error>> {
     let RenderedView { width, height, rgba } = &job.picture;
     let backdrop = vec![BACKDROP; *width as usize * *height as usize * 3];
     let mut jpeg = Vec::new();
@@ -274,7 +298,7 @@ mod tests {
 
     use super::*;
 
-    /// Publishes a view a turn, encoded by `encode`, until the threads are as wanted.
+    /// Publishes views, encoded by `encode`, until the encoder's health is as wanted.
     fn publish_until(
         encode: impl Fn(u64) + Send + 'static,
         is_wanted: impl Fn(&ThreadHealth) -> bool,

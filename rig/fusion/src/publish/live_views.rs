@@ -1,26 +1,28 @@
-//! The views that a live rig publishes: its own, and those that viewers ask for.
+//! Views that a live rig publishes: its own, and those that viewers request. Only watched views are rendered, within the viewers' budget
+//! of pixels.
 
 use std::time::{Duration, Instant};
 
 use flyrig_types::FrameSet;
 use serde::{Deserialize, Serialize};
 
-use crate::{FusionError, LivePublisher, Session, orbit, settings::check};
+use super::{live_publisher::LivePublisher, orbit::orbit};
+use crate::{error::FusionError, session::Session, settings::range::check};
 
-/// Turns a second of the rig's own views, so that a viewer who stands still sees all sides.
+/// Turns per second of the rig's own views, so that a viewer who stands still sees all sides.
 const ORBIT_TURNS_PER_SECOND: f64 = 0.05;
 
-/// The table `[output]`.
+/// Table `[output]`: the published views and people.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields, default)]
 pub struct OutputSettings {
-    /// Views on a circle around the people.
+    /// Number of views on a circle around the people.
     pub views: usize,
-    /// Pixels.
+    /// Width of each view, pixels.
     pub width: u32,
-    /// Pixels.
+    /// Height of each view, pixels.
     pub height: u32,
-    /// Quality of the published JPEG images, 1 to 100.
+    /// Quality of the published JPEG images, 1..=100.
     pub jpeg_quality: u8,
     /// Whether the Gaussians are published as well.
     pub splats: bool,
@@ -47,7 +49,7 @@ impl OutputSettings {
     }
 }
 
-/// Draws and publishes views. Nothing is drawn without a recipient.
+/// Renderer and publisher of views. Nothing is rendered without a recipient.
 #[derive(Debug)]
 pub struct LiveViews {
     names: Vec<String>,
@@ -56,17 +58,17 @@ pub struct LiveViews {
 }
 
 impl LiveViews {
-    /// The rig's own views: `main`, `main-1`, ... spread around the people.
+    /// Chooses the rig's own views: `main`, `main-1`, ... spread around the people.
     #[must_use]
     pub fn new(settings: &OutputSettings) -> Self {
         let name = |i: usize| if i == 0 { "main".to_owned() } else { format!("main-{i}") };
         Self { names: (0..settings.views).map(name).collect(), width: settings.width, height: settings.height }
     }
 
-    /// Draws the watched views and hands them to the publisher. `at` turns the rig's own views. Returns how many were drawn.
+    /// Renders the watched views and hands them to the publisher. `at` turns the rig's own views. Returns the number of rendered views.
     ///
     /// # Errors
-    /// Faults of the graphics device and of the transport session; a viewer's view that cannot be drawn is not one.
+    /// Faults of the graphics device and of the transport session. A requested view that cannot be rendered is no error.
     pub fn publish(
         &self,
         session: &mut Session,
@@ -96,7 +98,7 @@ impl LiveViews {
                     count += 1;
                 }
                 Err(error) => {
-                    // The request is to blame, whatever it did to the device: nobody else loses anything by it.
+                    // The request is to blame, whatever it did to the device: no other viewer loses anything by it.
                     publisher.publisher().refuse_viewpoint(&viewpoint.subscriber, &error.to_string());
                     tracing::warn!(viewer = viewpoint.subscriber, %error, "viewpoint refused");
                     if error.is_device_fault() {

@@ -1,10 +1,27 @@
-//! Cameras of our own: a circle around the person.
+//! Virtual cameras on a circle around the person.
 
 use flyrig_types::{Camera, CameraId, Intrinsics, Isometry, Rig};
 use glam::DQuat;
 
-/// Returns a camera on a circle around the person, starting beside the rig's first camera. `turn` in whole turns. The field
-/// of view is that of the rig's first camera.
+/// Returns a virtual camera on a circle around the person: `turn` whole turns from the rig's first camera, with its field of view. `None` for
+/// a rig without cameras.
+///
+/// # Example
+/// ```
+/// use flyrig_fusion::{orbit, types::{Camera, Intrinsics, Isometry, Rig}};
+/// use glam::DVec3;
+///
+/// let camera = Camera {
+///     id: "front".into(),
+///     intrinsics: Intrinsics::pinhole(640, 480, 500.0),
+///     camera_from_world: Isometry::look_at(DVec3::new(0.0, 1.0, 3.0), DVec3::Y, DVec3::Y),
+///     time_offset_nanos: 0,
+///     color: Default::default(),
+/// };
+/// let rig = Rig { cameras: vec![camera], world_up: DVec3::Y };
+/// let side = orbit(&rig, 0.25, 320, 240, "side").expect("the rig has a camera");
+/// assert_eq!(side.size(), [320, 240]);
+/// ```
 #[must_use]
 pub fn orbit(rig: &Rig, turn: f64, width: u32, height: u32, name: &str) -> Option<Camera> {
     let first = rig.cameras.first()?;

@@ -1,48 +1,53 @@
-//! A budget of time: how much work the next set gets, so that sets are taken in as often as is wanted.
+//! Budget of time: the level of effort at which frame sets are processed as often as wanted.
+//!
+//! The smoothed cost of a frame set, its views included, is compared with 0.85 of the period. What is left out first costs the fewest
+//! decibels per millisecond (docs/benchmarks/budget.md).
 
 use std::time::Duration;
 
 use flyrig_transport::BudgetStats;
 
-use crate::{BudgetSettings, Effort};
+use crate::settings::{budget::BudgetSettings, effort::Effort};
 
-/// Share of the period that work may take: the rest absorbs sets that take longer.
+/// Share of the period that work may take; the rest absorbs frame sets that take longer.
 const USABLE: f64 = 0.85;
-/// A level with more work is tried where it is expected to take no more than this share of what is usable.
+/// Largest expected share of the usable time at which a level with more work is tried.
 const SURE: f64 = 0.9;
-/// Share of the newest set in the smoothed cost.
+/// Share of the newest frame set in the smoothed cost.
 const NEWEST: f64 = 0.2;
-/// A set counts as no dearer than this multiple of the smoothed cost: one hiccup is no change.
+/// Largest cost of one frame set that counts, as a multiple of the smoothed cost: one hiccup is no change.
 const HICCUP: f64 = 3.0;
-/// Sets after a change of level until its cost is known.
+/// Frame sets after a change of level until its cost is known.
 const SETTLE: u32 = 6;
-/// Sets until more work is tried, and the most that this doubles to after attempts that failed.
+/// Frame sets until more work is tried.
 const FIRST_WAIT: u32 = 15;
+/// Longest wait, in frame sets, to which [`FIRST_WAIT`] doubles after attempts that failed.
 const LONGEST_WAIT: u32 = 960;
-/// Sets after which a level with more work has proven itself.
+/// Frame sets after which a level with more work has proven itself.
 const PROVEN: u32 = 60;
-/// Cost of each level over that of the one before it, until it has been measured.
+/// Cost of each level as a share of that of the level before it, until it has been measured.
 const EXPECTED_STEP: f64 = 0.9;
 const LEVELS: usize = Effort::LEVELS.len();
 
-/// Chooses the level of effort from what sets have cost.
+/// Choice of the level of effort from the cost of past frame sets.
 ///
-/// The smoothed cost of a set is compared with a share of the period. Less work follows at once, by as many levels as it takes;
-/// more work only where its expected cost leaves a margin, and after ever longer waits where that has failed before.
+/// Less work follows at once, by as many levels as it takes. More work is tried only where its expected cost leaves a margin, and after
+/// ever longer waits where that has failed before.
 #[derive(Debug, Clone)]
 pub struct Budget {
     settings: BudgetSettings,
     level: usize,
-    /// Smoothed cost of a set, seconds; `None` before the first one at this level.
+    /// Smoothed cost of a frame set, seconds; `None` before the first one at this level.
     cost: Option<f64>,
-    /// Sets at this level.
+    /// Frame sets at this level.
     sets: u32,
-    /// Cost of each level over that of the one before it.
+    /// Cost of each level as a share of that of the level before it.
     steps: [f64; LEVELS],
-    /// The level before the last change and what it cost.
+    /// Level before the last change, and its cost, seconds.
     before: Option<(usize, f64)>,
+    /// Frame sets until more work is tried.
     wait: u32,
-    /// Seconds that the set under way has cost so far; `None` for one that does not count.
+    /// Cost so far of the frame set under way, seconds; `None` for one that does not count.
     spent: Option<f64>,
 }
 
@@ -60,32 +65,32 @@ impl Budget {
         }
     }
 
-    /// Sets a second that are wanted; `None` without a budget.
+    /// Returns the wanted number of frame sets per second; `None` without a budget.
     #[must_use]
     pub fn fps(&self) -> Option<f64> {
         (self.settings.fps > 0.0 && self.settings.effort.is_none()).then_some(self.settings.fps)
     }
 
-    /// Level of effort, 0 with all the work; at most [`Effort::LEVELS`] less one.
+    /// Returns the level of effort, an index into [`Effort::LEVELS`]; 0 does all the work.
     #[must_use]
     pub fn level(&self) -> usize {
         self.level
     }
 
-    /// The work that the next set gets.
+    /// Returns the work that the next frame set gets.
     #[must_use]
     pub fn effort(&self) -> Effort {
         self.settings.effort.unwrap_or(Effort::LEVELS[self.level])
     }
 
-    /// Adds time that the set under way has cost.
+    /// Adds time that was spent on the frame set under way.
     pub fn spend(&mut self, time: Duration) {
         if let Some(spent) = &mut self.spent {
             *spent += time.as_secs_f64();
         }
     }
 
-    /// Leaves the set under way out: its cost says nothing about the next ones'.
+    /// Leaves out the frame set under way, whose cost says nothing about later ones.
     pub(crate) fn leave_out(&mut self) {
         self.spent = None;
     }
@@ -97,7 +102,7 @@ impl Budget {
         self.fps().map(|fps| BudgetStats { fps, level: self.level as u32, levels: LEVELS as u32, set_secs })
     }
 
-    /// Ends the set under way and chooses the level of the next one.
+    /// Ends the frame set under way and chooses the level of the next one.
     pub(crate) fn next_set(&mut self) {
         let spent = self.spent.replace(0.0).filter(|spent| *spent > 0.0);
         let Some((fps, spent)) = self.fps().zip(spent) else { return };
@@ -139,7 +144,7 @@ impl Budget {
         }
     }
 
-    /// Measures the cost of this level against that of the one before the change.
+    /// Learns the cost of this level relative to that of the level before the change.
     fn learn_step(&mut self, cost: f64) {
         let Some((before, cost_before)) = self.before else { return };
         let (low, high, ratio) = if before < self.level {

@@ -1,175 +1,104 @@
-//! A session: frame sets in, people as Gaussians and views out.
+//! Session: frame sets in, people as Gaussians and views out.
+//!
+//! [`Session::process`] runs two halves that share no state. Perception ([`perceiver`]) turns a frame set into one observation per
+//! person; the reconstruction hands each observation to its [`Subject`]. Perception never reads a reconstruction, so
+//! [`crate::LiveRig`] runs the perception of the next frame set beside the reconstruction of this one, with equal results.
+//!
+//! [`newcomers`] prepares the subjects of people who arrive: in place, or in threads beside the session. [`view_renderer`] renders all people
+//! into one view. With a budget, [`budget`] chooses the level of effort, and [`stillness`] leaves frame sets out while nothing moves.
+
+pub(crate) mod budget;
+mod builder;
+mod newcomers;
+pub(crate) mod outcome;
+pub(crate) mod perceiver;
+mod stillness;
+pub(crate) mod view_renderer;
 
 use std::{collections::BTreeMap, sync::Arc, time::Instant};
 
 use flyrig_gpu::GpuContext;
-use flyrig_renderer::{GaussianBuffers, Splat};
+use flyrig_renderer::{GaussianBuffers, RenderTarget, Splat};
 use flyrig_types::{Camera, Frame, FrameSet, Image, PersonId, Pose, RenderedView, Rig};
 
 use crate::{
-    Budget, Effort, FusionError, NetworksOn, Observation, Perception, PersonFrame, PersonMemory, Remedy, SeenPerson,
-    SessionSettings, StageTimes, Subject, ViewObservation,
-    drawing::Drawing,
-    newcomers::Newcomers,
-    perceiver::{Newcomer, Perceived, Perceiver},
-    stillness::Stillness,
-    subject::{InputView, Observed},
+    error::FusionError,
+    health::stage_times::StageTimes,
+    perception::observation::{Perception, PersonObservation, SeenPerson, ViewObservation},
+    settings::{effort::Effort, session::SessionSettings},
+    subject::{InputView, Observed, Subject, memory::PersonMemory, stream_frame::PersonFrame, track_watch::Remedy},
 };
 
-/// Result of one frame set.
-#[derive(Debug, Clone, PartialEq)]
-pub enum Outcome {
-    /// At least one person was posed and coloured.
-    Updated,
-    /// Nothing moved in any image since everybody was updated: left out to save time, which only a budget does.
-    Still,
-    /// Nobody was updated, for this reason.
-    Held(String),
-}
+pub use budget::Budget;
+pub use builder::SessionBuilder;
+pub use outcome::{Counts, Outcome};
 
-/// Counts of the faults that a session went on after, over all people.
-#[derive(Debug, Clone, Default, PartialEq, Eq, serde::Serialize)]
-pub struct Counts {
-    /// Updates of people.
-    pub updated: u64,
-    /// People without a usable pose in a set.
-    pub lost: u64,
-    /// Images without a mask of a person, or with an empty one.
-    pub without_mask: u64,
-    /// Updates whose deformation was dropped because a number was not finite.
-    pub poisoned: u64,
-}
+use newcomers::Newcomers;
+use perceiver::{Newcomer, Perceived, Perceiver};
+use stillness::Stillness;
+use view_renderer::ViewRenderer;
 
-/// Builds a [`Session`].
-pub struct SessionBuilder {
-    gpu: GpuContext,
-    rig: Rig,
-    settings: SessionSettings,
-    perception: Option<Box<dyn Perception>>,
-    saved: BTreeMap<PersonId, PersonMemory>,
-}
-
-impl SessionBuilder {
-    /// Starts from a device and the input cameras, in the order of the frame sets' slots.
-    #[must_use]
-    pub fn new(gpu: GpuContext, rig: Rig) -> Self {
-        Self { gpu, rig, settings: SessionSettings::default(), perception: None, saved: BTreeMap::new() }
-    }
-
-    /// Chooses the settings; the defaults otherwise.
-    #[must_use]
-    pub fn settings(self, settings: SessionSettings) -> Self {
-        Self { settings, ..self }
-    }
-
-    /// Chooses how people are found. Without, nobody ever is.
-    #[must_use]
-    pub fn perception(self, perception: impl Perception + 'static) -> Self {
-        Self { perception: Some(Box::new(perception)), ..self }
-    }
-
-    /// Resumes a person from what an earlier session has learnt.
-    #[must_use]
-    pub fn person(mut self, id: PersonId, memory: PersonMemory) -> Self {
-        self.saved.insert(id, memory);
-        self
-    }
-
-    /// Samples the surfaces of the people known so far and prepares the GPU. Takes a few seconds.
-    ///
-    /// # Errors
-    /// [`FusionError`] names the setting, template or saved person that cannot be used, or what the GPU refuses.
-    pub fn build(self) -> Result<Session, FusionError> {
-        self.settings.validate()?;
-        let gpu = place_kernels(&self.gpu, &self.settings);
-        let mut session = Session {
-            drawing: Drawing::new(&gpu, self.settings.body.gaussians)?,
-            gpu,
-            budget: Budget::new(self.settings.budget),
-            stillness: Stillness::default(),
-            rig: self.rig,
-            settings: self.settings,
-            perceiver: self.perception.map(Perceiver::new).unwrap_or_default(),
-            subjects: Vec::new(),
-            saved: self.saved,
-            newcomers: Newcomers::default(),
-            keep_observations: false,
-            shape_held: false,
-            stages: StageTimes::default(),
-            counts: Counts::default(),
-        };
-        let people = session.perceiver.newcomers(&[]);
-        session.add_people(people)?;
-        Ok(session)
-    }
-}
-
-/// The context of a session's kernels. Networks on the adapter need the colours there.
-fn place_kernels(gpu: &GpuContext, settings: &SessionSettings) -> GpuContext {
-    let networks_on_adapter =
-        settings.appearance.mode.is_learned() && settings.appearance.networks_on == NetworksOn::Adapter;
-    if networks_on_adapter { gpu.clone() } else { gpu.fastest() }
-}
-
-/// The live reconstruction of any number of people from one rig.
+/// Live reconstruction of any number of people from one rig.
+///
+/// Built by [`SessionBuilder`]. `flyrig run`, `eval`, `demo`, `train` and `flyrig-bench` all use it.
 pub struct Session {
     gpu: GpuContext,
     rig: Rig,
     settings: SessionSettings,
     perceiver: Perceiver,
     subjects: Vec<Subject>,
-    drawing: Drawing,
-    /// Of people who are not subjects yet.
+    view_renderer: ViewRenderer,
+    /// Memories of people who are not subjects yet.
     saved: BTreeMap<PersonId, PersonMemory>,
     newcomers: Newcomers,
     keep_observations: bool,
     shape_held: bool,
     stillness: Stillness,
-    /// Budget of time; whoever draws views of a set adds their time ([`Budget::spend`]).
+    /// Budget of time. Programs that draw views of a frame set add their time ([`Budget::spend`]).
     pub budget: Budget,
-    /// Run times of every stage so far.
+    /// Run times of all stages so far.
     pub stages: StageTimes,
-    /// Counts so far.
+    /// Counts of updates and faults so far.
     pub counts: Counts,
 }
 
 impl Session {
-    /// The input cameras.
+    /// Returns the input cameras.
     #[must_use]
     pub fn rig(&self) -> &Rig {
         &self.rig
     }
 
-    /// The device that everything runs on.
+    /// Returns the device that everything runs on.
     #[must_use]
     pub fn gpu(&self) -> &GpuContext {
         &self.gpu
     }
 
-    /// The people, in the order in which they were first known.
+    /// Returns the people, in the order in which they were first known.
     #[must_use]
     pub fn subjects(&self) -> &[Subject] {
         &self.subjects
     }
 
-    /// One person.
+    /// Returns one person; `None` where the session does not know it.
     #[must_use]
     pub fn subject(&self, person: PersonId) -> Option<&Subject> {
         self.subjects.iter().find(|subject| subject.id() == person)
     }
 
-    /// Whether anybody has been posed yet.
+    /// Returns whether any person has been posed yet.
     #[must_use]
     pub fn has_people(&self) -> bool {
-        self.subjects.iter().any(|subject| subject.last_pose.is_some())
+        self.subjects.iter().any(|subject| subject.pose().is_some())
     }
 
-    /// Finds people in another way from now on.
+    /// Replaces perception from the next frame set on.
     pub fn set_perception(&mut self, perception: impl Perception + 'static) {
         self.perceiver = Perceiver::new(Box::new(perception));
     }
 
-    /// Keeps the observations of each view from the next set on, for [`Self::observed`].
+    /// Keeps the observations of each view from the next frame set on, for [`Self::observed`].
     ///
     /// # Errors
     /// [`FusionError::Gpu`] when the adapter has no room for them.
@@ -178,21 +107,21 @@ impl Session {
         self.subjects.iter_mut().try_for_each(|subject| subject.keep_observations(&self.gpu))
     }
 
-    /// Suspends the deformation: colours go on settling on the surface as it is.
+    /// Suspends the deformation, or lets it go on. Meanwhile colours keep settling on the surface as it is.
     pub fn hold_shape(&mut self, hold: bool) {
         self.shape_held = hold;
-        self.subjects.iter_mut().for_each(|subject| subject.shape_held = hold);
+        self.subjects.iter_mut().for_each(|subject| subject.hold_shape(hold));
     }
 
-    /// Explains every image with the pose of its own capture time, or of its set's.
+    /// Chooses whether every image is explained with the pose of its own capture time, or with that of its frame set.
     pub fn set_per_view_time(&mut self, per_view_time: bool) {
         self.settings.tracking.per_view_time = per_view_time;
     }
 
-    /// Takes in one frame set. A person who is not found keeps the last state.
+    /// Processes one frame set. A person who is not found keeps the last state.
     ///
     /// # Errors
-    /// Only errors from which later sets cannot recover. After one that [is a device fault](FusionError::is_device_fault), call
+    /// Only errors from which later frame sets cannot recover. After one that [is a device fault](FusionError::is_device_fault), call
     /// [`Self::rebuild`].
     pub fn process(&mut self, set: &FrameSet) -> Result<Outcome, FusionError> {
         let start = Instant::now();
@@ -202,35 +131,36 @@ impl Session {
         outcome
     }
 
-    /// Observes the people in a set, for [`Self::reconstruct`].
+    /// Observes the people in a frame set, for [`Self::reconstruct`].
     pub(crate) fn perceive(&mut self, set: &FrameSet) -> Result<Perceived, FusionError> {
-        if self.may_rest(set) {
+        if self.can_skip(set) {
             return Ok(Perceived::Still);
         }
         self.ready_perceiver();
         self.perceiver.perceive(set)
     }
 
-    /// Returns whether a set may be left out because nothing moves, which only a budget allows.
-    pub(crate) fn may_rest(&mut self, set: &FrameSet) -> bool {
-        self.budget.fps().is_some() && self.stillness.may_rest(set, self.has_people())
+    /// Returns whether a frame set can be left out because nothing moves. Needs a budget.
+    pub(crate) fn can_skip(&mut self, set: &FrameSet) -> bool {
+        self.budget.fps().is_some() && self.stillness.can_skip(set, self.has_people())
     }
 
-    /// Measures everybody's shape again from the next sets on, for a body that does not fit. A person whose shape comes out
-    /// differently is learnt anew, colours included. Returns whether shapes are measured at all: not where they are given,
-    /// nor by a single camera.
+    /// Measures the shapes of all people again from the next frame sets on, for a body that does not fit. A person whose shape comes out
+    /// differently is learnt anew, colours included. Returns whether shapes are measured at all: not where they are given, nor by a
+    /// single camera.
     pub fn measure_again(&mut self) -> bool {
         self.perceiver.measure_again()
     }
 
-    /// Lends perception out, ready for the next set; until it is returned this session finds nobody.
+    /// Lends perception out, ready for the next frame set. Until it is returned, this session finds no person.
     pub(crate) fn lend_perceiver(&mut self) -> Perceiver {
         self.ready_perceiver();
         std::mem::take(&mut self.perceiver)
     }
 
+    /// Hands effort and known people to perception.
     fn ready_perceiver(&mut self) {
-        let known = self.subjects.iter().map(|subject| (subject.id(), subject.shape)).collect();
+        let known = self.subjects.iter().map(|subject| (subject.id(), subject.shape_number)).collect();
         self.perceiver.ready(self.budget.effort(), known);
     }
 
@@ -239,7 +169,7 @@ impl Session {
         self.perceiver = perceiver;
     }
 
-    /// Updates the people from what [`Self::perceive`] found in the same set. Does not use perception.
+    /// Updates the people from the result of [`Self::perceive`] for the same frame set. Does not use perception.
     pub(crate) fn reconstruct(&mut self, set: &FrameSet, perceived: Perceived) -> Result<Outcome, FusionError> {
         let start = Instant::now();
         let Perceived::People { observations, newcomers, effort, stages, took } = perceived else {
@@ -251,39 +181,39 @@ impl Session {
         let before = self.gpu.traffic();
         let outcome = self.update_people(set, observations, newcomers, effort);
         self.stages.count_traffic(self.gpu.traffic().since(before));
-        self.stillness.taken_in(set.master_nanos, took + start.elapsed());
+        self.stillness.ingested(set.master_nanos, took + start.elapsed());
         outcome
     }
 
     fn update_people(
         &mut self,
         set: &FrameSet,
-        observations: Vec<Observation>,
+        observations: Vec<PersonObservation>,
         newcomers: Vec<Newcomer>,
         effort: Effort,
     ) -> Result<Outcome, FusionError> {
         self.gpu.check()?;
         self.add_people(newcomers)?;
-        let mut outcome = Outcome::Held("nobody is known".to_owned());
+        let mut outcome = Outcome::Held("no person is known".to_owned());
         for observation in observations {
             match observation {
-                Observation::Lost { person, reason } => {
+                PersonObservation::Lost { person, reason } => {
                     self.counts.lost += 1;
                     if let Some(subject) = self.subjects.iter_mut().find(|subject| subject.id() == person) {
-                        subject.watch.away(set.master_nanos);
+                        subject.track.watch.leave(set.master_nanos);
                     }
                     if outcome != Outcome::Updated {
                         outcome = Outcome::Held(reason);
                     }
                 }
-                Observation::Seen(seen)
+                PersonObservation::Seen(seen)
                     if self.newcomers.is_preparing(seen.person) && self.subject(seen.person).is_none() =>
                 {
                     if outcome != Outcome::Updated {
                         outcome = Outcome::Held(format!("person {} is being prepared", seen.person));
                     }
                 }
-                Observation::Seen(seen) => {
+                PersonObservation::Seen(seen) => {
                     self.update(set, &seen, effort)?;
                     outcome = Outcome::Updated;
                 }
@@ -292,7 +222,7 @@ impl Session {
         Ok(outcome)
     }
 
-    /// A camera stands elsewhere from the next set on; `plate` is the empty scene as it sees it now, where one is known. A slot that
+    /// Moves a camera from the next frame set on. `plate` is the empty scene as the camera sees it now, where one is known. A slot that
     /// does not exist changes nothing.
     ///
     /// # Errors
@@ -305,19 +235,19 @@ impl Session {
         Ok(())
     }
 
-    /// Prepares people who arrive in threads of their own from now on, and lets perception measure them there, so that nobody
-    /// waits meanwhile. Results then depend on the speed of the machine.
+    /// Prepares people who arrive in threads of their own from now on, and lets perception measure them there, so that no frame set waits
+    /// for them. Results then depend on the speed of the machine.
     pub fn work_beside(&mut self) {
         self.newcomers.work_beside();
         self.perceiver.work_beside();
     }
 
-    /// Makes subjects of people who are none yet, and of those whose shape is another now.
+    /// Creates subjects for people who have none yet, and for those whose shape has changed.
     fn add_people(&mut self, people: Vec<Newcomer>) -> Result<(), FusionError> {
         for newcomer in people {
             let (id, outfit) = (newcomer.person, newcomer.outfit);
             let place = self.subjects.iter().position(|subject| subject.id() == id);
-            if place.is_some_and(|place| self.subjects[place].shape == newcomer.shape) {
+            if place.is_some_and(|place| self.subjects[place].shape_number == newcomer.shape) {
                 continue;
             }
             let subject = self.newcomers.subject(newcomer, &self.gpu, &self.rig, &self.settings)?;
@@ -325,7 +255,7 @@ impl Session {
             if self.keep_observations {
                 subject.keep_observations(&self.gpu)?;
             }
-            subject.shape_held = self.shape_held;
+            subject.hold_shape(self.shape_held);
             // Colours and deformation belong to one surface: clothes may be found later.
             if self.saved.get(&id).is_some_and(|memory| memory.outfit() == outfit)
                 && let Some(memory) = self.saved.remove(&id)
@@ -340,79 +270,58 @@ impl Session {
         Ok(())
     }
 
-    /// Takes in one person of a set.
+    /// Updates one person from a frame set.
     fn update(&mut self, set: &FrameSet, seen: &SeenPerson, effort: Effort) -> Result<(), FusionError> {
         let Some(subject) = self.subjects.iter_mut().find(|subject| subject.id() == seen.person) else {
             return Err(FusionError::NoSuchPerson(seen.person));
         };
         let pose = &seen.pose;
-        subject.curve.push(set.master_nanos, pose);
-        let pose_of = |(view, (_, frame)): (&ViewObservation, (usize, &Arc<Frame>))| {
-            if !self.settings.tracking.per_view_time || frame.capture_nanos == set.master_nanos {
-                return None;
-            }
-            view.pose.clone().or_else(|| subject.curve.at(frame.capture_nanos)).filter(Pose::is_valid)
-        };
-        let poses: Vec<Option<Pose>> = seen.views.iter().zip(set.present()).map(pose_of).collect();
-        let (mut slots, mut views) = (Vec::new(), Vec::new());
-        for (((slot, frame), view), pose) in set.present().zip(&seen.views).zip(&poses) {
-            let mask = view.mask.as_ref().filter(|mask| mask.area_px() > 0);
-            if let Some((mask, camera)) = mask.zip(self.rig.cameras.get(slot)) {
-                slots.push(slot);
-                let others = view.others.as_ref();
-                let (image, edge_colors) = (&frame.image, view.edge_colors.as_slice());
-                views.push(InputView { camera, image, mask, edge_colors, others, pose: pose.as_ref() });
-                continue;
-            }
-            self.counts.without_mask += 1;
-            // The 1st, 2nd, 4th ...: a camera that sees nobody all night must not fill the disk.
-            if self.counts.without_mask.is_power_of_two() {
-                let (camera, count) = (&frame.camera, self.counts.without_mask);
-                tracing::warn!(set = set.index, %camera, count, "no person in the mask; going on without this view");
-            }
-        }
+        subject.track.curve.push(set.master_nanos, pose);
+        let per_view_time = self.settings.tracking.per_view_time;
+        let poses = view_poses(set, seen, per_view_time, |nanos| subject.track.curve.at(nanos));
+        let (slots, views) = input_views(set, seen, &poses, &self.rig, &mut self.counts);
         if views.is_empty() {
-            subject.watch.away(set.master_nanos);
+            subject.track.watch.leave(set.master_nanos);
         } else {
-            match subject.watch.arrive(set.master_nanos, pose) {
+            match subject.track.watch.arrive(set.master_nanos, pose) {
                 Remedy::Forget => subject.forget(&self.gpu)?,
                 Remedy::Restart => subject.restart(),
                 Remedy::None => {}
             }
         }
-        if subject.viewed != slots {
-            subject.viewed = slots;
+        if subject.track.viewed != slots {
+            subject.track.viewed = slots;
             subject.views_changed();
         }
-        subject.confidence = seen.confidence;
-        self.drawing.people_changed();
-        subject.update(&self.gpu, &mut self.drawing.rasterizer, pose, &views, effort, &mut self.stages)?;
+        subject.track.confidence = seen.confidence;
+        self.view_renderer.people_changed();
+        subject.update(&self.gpu, &mut self.view_renderer.rasterizer, pose, &views, effort, &mut self.stages)?;
         if subject.is_new() {
             // Gets all the work at whatever level.
             self.budget.leave_out();
         }
         if !views.is_empty() {
             let ids = views.iter().map(|view| view.camera.id.clone());
-            let judged = ids.zip(subject.agreement()).filter_map(|(id, quality)| Some((id, quality?)));
-            subject.watch.judge(judged);
+            let agreement = ids.zip(subject.agreement()).filter_map(|(id, quality)| Some((id, quality?)));
+            subject.track.watch.assess(agreement);
         }
         self.counts.poisoned += u64::from(subject.deform_report().is_some_and(|report| report.poisoned));
-        subject.last_pose = Some(seen.pose.clone());
+        subject.track.last_pose = Some(seen.pose.clone());
         self.counts.updated += 1;
         Ok(())
     }
 
-    /// Draws everybody as `camera` would see them now.
+    /// Renders all people as `camera` would see them now: sRGB with straight alpha.
     ///
     /// # Errors
     /// [`FusionError::Gpu`]; a view that is too large for the adapter leaves the session as it was.
     pub fn render(&mut self, camera: &Camera) -> Result<RenderedView, FusionError> {
-        if !self.drawing.is_timed_by_adapter() {
+        if !self.view_renderer.is_timed_by_adapter() {
             // Else the time of the updates under way would be that of the view.
             self.gpu.wait()?;
         }
         self.subjects.iter_mut().for_each(|subject| subject.collect_times(&mut self.stages));
-        let posed = |subject: &&Subject| subject.last_pose.is_some();
+        let posed = |subject: &&Subject| subject.pose().is_some();
         let mut people: Vec<&GaussianBuffers> = self.subjects.iter().filter(posed).map(Subject::gaussians).collect();
         if people.is_empty() {
             // Before the first pose: as the surfaces were made.
@@ -423,18 +332,18 @@ impl Session {
             return Ok(RenderedView { width, height, rgba: vec![0; 4 * width as usize * height as usize] });
         }
         let before = self.gpu.traffic();
-        let view = self.drawing.render(&self.gpu, &people, camera, &mut self.stages);
+        let view = self.view_renderer.render(&self.gpu, &people, camera, &mut self.stages);
         self.stages.count_traffic(self.gpu.traffic().since(before));
         view
     }
 
-    /// Largest view that the adapter can hold, pixels.
+    /// Returns the size of the largest view that the adapter can hold, pixels.
     #[must_use]
     pub fn max_view_pixels(&self) -> u64 {
-        flyrig_renderer::RenderTarget::max_pixels(&self.gpu)
+        RenderTarget::max_pixels(&self.gpu)
     }
 
-    /// Reads a person's Gaussians back, as they were drawn last.
+    /// Reads back a person's Gaussians as of the last frame set.
     ///
     /// # Errors
     /// [`FusionError::NoSuchPerson`], [`FusionError::Gpu`].
@@ -442,7 +351,7 @@ impl Session {
         self.known(person)?.splats(&self.gpu)
     }
 
-    /// Reads a person's colours back for the person stream, with its motion at this set; None before its first pose.
+    /// Reads back a person's colours for the person stream, with its motion in this frame set; `None` before its first pose.
     ///
     /// # Errors
     /// [`FusionError::NoSuchPerson`] and [`FusionError::Gpu`].
@@ -458,14 +367,14 @@ impl Session {
         self.known(person)?.observed(&self.gpu)
     }
 
-    /// Cameras whose images a person's last update took in, in the order of [`Subject::input`].
+    /// Returns the cameras whose images a person's last update used, in the order of [`Subject::input`].
     #[must_use]
     pub fn viewed(&self, person: PersonId) -> Vec<Camera> {
-        let slots = self.subject(person).map_or(&[][..], |subject| &subject.viewed);
+        let slots = self.subject(person).map_or(&[][..], |subject| &subject.track.viewed);
         slots.iter().filter_map(|&slot| self.rig.cameras.get(slot).cloned()).collect()
     }
 
-    /// Reads back what was learnt about a person, to resume from it in another session.
+    /// Reads back a person's memory, to resume from it in another session.
     ///
     /// # Errors
     /// [`FusionError::NoSuchPerson`], [`FusionError::Gpu`].
@@ -473,8 +382,8 @@ impl Session {
         self.known(person)?.memory(&self.gpu)
     }
 
-    /// Builds everything anew on another device and resumes the people from `memories`; those without one start afresh.
-    /// Poses, quality, counts and run times are kept. After an error the session is as it was.
+    /// Builds everything again on another device and resumes the people from `memories`; people without a memory start anew. Poses,
+    /// quality, counts and run times are kept. After an error the session is as it was.
     ///
     /// # Errors
     /// [`FusionError`] when the new device fails as well.
@@ -483,12 +392,12 @@ impl Session {
         gpu: &GpuContext,
         memories: &BTreeMap<PersonId, PersonMemory>,
     ) -> Result<(), FusionError> {
-        let gpu = place_kernels(gpu, &self.settings);
-        let drawing = Drawing::new(&gpu, self.settings.body.gaussians)?;
+        let gpu = gpu.fastest();
+        let view_renderer = ViewRenderer::new(&gpu, self.settings.body.gaussians)?;
         let mut subjects = Vec::new();
         for old in &self.subjects {
-            let (shape, outfit) = old.shape_and_outfit();
-            let mut subject = Subject::new(&gpu, old.id(), (shape, outfit), &self.rig, &self.settings)?;
+            let (body, outfit) = (old.body().clone(), old.outfit());
+            let mut subject = Subject::new(&gpu, old.id(), (body, outfit), &self.rig, &self.settings)?;
             if self.keep_observations {
                 subject.keep_observations(&gpu)?;
             }
@@ -499,11 +408,55 @@ impl Session {
             subjects.push(subject);
         }
         self.newcomers.clear();
-        (self.gpu, self.drawing, self.subjects) = (gpu, drawing, subjects);
+        (self.gpu, self.view_renderer, self.subjects) = (gpu, view_renderer, subjects);
         Ok(())
     }
 
     fn known(&self, person: PersonId) -> Result<&Subject, FusionError> {
         self.subject(person).ok_or(FusionError::NoSuchPerson(person))
     }
+}
+
+/// Returns the pose at each image's own time, where it differs from the frame set's: the observed one, else that of `curve`.
+fn view_poses(
+    set: &FrameSet,
+    seen: &SeenPerson,
+    per_view_time: bool,
+    curve: impl Fn(i64) -> Option<Pose>,
+) -> Vec<Option<Pose>> {
+    let pose = |(view, (_, frame)): (&ViewObservation, (usize, &Arc<Frame>))| {
+        if !per_view_time || frame.capture_nanos == set.master_nanos {
+            return None;
+        }
+        view.pose.clone().or_else(|| curve(frame.capture_nanos)).filter(Pose::is_valid)
+    };
+    seen.views.iter().zip(set.present()).map(pose).collect()
+}
+
+/// Returns the views with a mask of the person, and their slots. Counts and logs the others.
+fn input_views<'a>(
+    set: &'a FrameSet,
+    seen: &'a SeenPerson,
+    poses: &'a [Option<Pose>],
+    rig: &'a Rig,
+    counts: &mut Counts,
+) -> (Vec<usize>, Vec<InputView<'a>>) {
+    let (mut slots, mut views) = (Vec::new(), Vec::new());
+    for (((slot, frame), view), pose) in set.present().zip(&seen.views).zip(poses) {
+        let mask = view.mask.as_ref().filter(|mask| mask.area_px() > 0);
+        if let Some((mask, camera)) = mask.zip(rig.cameras.get(slot)) {
+            slots.push(slot);
+            let others = view.others.as_ref();
+            let (image, edge_colors) = (&frame.image, view.edge_colors.as_slice());
+            views.push(InputView { camera, image, mask, edge_colors, others, pose: pose.as_ref() });
+            continue;
+        }
+        counts.without_mask += 1;
+        // The 1st, 2nd, 4th ...: a camera that sees no person all night must not fill the disk.
+        if counts.without_mask.is_power_of_two() {
+            let (camera, count) = (&frame.camera, counts.without_mask);
+            tracing::warn!(set = set.index, %camera, count, "no person in the mask; going on without this view");
+        }
+    }
+    (slots, views)
 }

@@ -1,4 +1,7 @@
-//! Subjects of people who are new: sampling a surface takes seconds, in which a live rig goes on.
+//! Preparation of subjects for people who arrive.
+//!
+//! Sampling a surface takes seconds. A live rig goes on meanwhile: each new person is prepared in a thread of its own, named "new person",
+//! and shown once the thread has ended.
 
 use std::{collections::BTreeMap, thread::JoinHandle};
 
@@ -6,9 +9,10 @@ use flyrig_body::{Outfit, Template};
 use flyrig_gpu::GpuContext;
 use flyrig_types::{PersonId, Rig};
 
-use crate::{FusionError, SessionSettings, perceiver::Newcomer, subject::Subject};
+use super::perceiver::Newcomer;
+use crate::{error::FusionError, settings::session::SessionSettings, subject::Subject};
 
-/// Name of the threads, for errors.
+/// Name of the threads, in errors.
 const NAME: &str = "new person";
 
 /// People whose subjects are being prepared.
@@ -16,16 +20,17 @@ const NAME: &str = "new person";
 pub(crate) struct Newcomers {
     /// Whether subjects are prepared in threads of their own.
     beside: bool,
+    /// Number of the shape, and thread, of each person.
     preparing: BTreeMap<PersonId, (u32, JoinHandle<Result<Subject, FusionError>>)>,
 }
 
 impl Newcomers {
-    /// Prepares subjects in threads of their own from now on: which set shows a new person first then depends on the machine.
+    /// Prepares subjects in threads of their own from now on. Which frame set shows a new person first then depends on the machine.
     pub fn work_beside(&mut self) {
         self.beside = true;
     }
 
-    /// Forgets whoever is being prepared: the device is another one.
+    /// Drops the people who are being prepared, for another device.
     pub fn clear(&mut self) {
         self.preparing.clear();
     }
@@ -35,7 +40,7 @@ impl Newcomers {
         self.preparing.contains_key(&person)
     }
 
-    /// Returns the subject of a newcomer, or `None` while it is being prepared. Call it again with the same newcomer then.
+    /// Returns the subject of a newcomer, or `None` while it is being prepared: call it again with that newcomer.
     ///
     /// # Errors
     /// Those of [`Subject::new`]; [`FusionError::ThreadFailed`] after a panic.
@@ -47,7 +52,7 @@ impl Newcomers {
         settings: &SessionSettings,
     ) -> Result<Option<Subject>, FusionError> {
         let Newcomer { person, shape, template, outfit } = newcomer;
-        // Somebody whose shape has changed meanwhile is begun again.
+        // A person whose shape has changed meanwhile is begun again.
         if let Some((_, thread)) = self.preparing.remove(&person).filter(|(of, _)| *of == shape) {
             if !thread.is_finished() {
                 self.preparing.insert(person, (shape, thread));
@@ -81,6 +86,6 @@ fn prepare(
     settings: &SessionSettings,
 ) -> Result<Subject, FusionError> {
     let mut subject = Subject::new(gpu, person, worn, rig, settings)?;
-    subject.shape = shape;
+    subject.shape_number = shape;
     Ok(subject)
 }

@@ -1,23 +1,28 @@
-//! One set's perception as a job that may run beside the reconstruction of the set before.
+//! Perception of one frame set as a job that can run beside the reconstruction of the frame set before it.
 
 use std::time::{Duration, Instant};
 
 use flyrig_body::{Outfit, Template};
 use flyrig_types::{Camera, FrameSet, Image, PersonId};
 
-use crate::{Effort, FusionError, KnownPerson, Observation, Perception, StageTimes};
+use crate::{
+    error::FusionError,
+    health::stage_times::StageTimes,
+    perception::observation::{KnownPerson, Perception, PersonObservation},
+    settings::effort::Effort,
+};
 
-/// Result of perception for one set.
+/// Result of perception for one frame set.
 pub(crate) enum Perceived {
-    /// Nothing moved: the set is left out.
+    /// Nothing moved, so the frame set is left out.
     Still,
-    /// The set was looked at.
+    /// People were observed.
     People {
-        /// One element a known person.
-        observations: Vec<Observation>,
+        /// One element per known person.
+        observations: Vec<PersonObservation>,
         /// People whom the session did not know when perception began, or knew in another shape.
         newcomers: Vec<Newcomer>,
-        /// The work that the set gets.
+        /// Work that the frame set gets.
         effort: Effort,
         /// Run times of perception's stages.
         stages: StageTimes,
@@ -26,7 +31,7 @@ pub(crate) enum Perceived {
     },
 }
 
-/// A person who is new to the session.
+/// Person who is new to the session, or has a new shape.
 pub(crate) struct Newcomer {
     pub person: PersonId,
     pub shape: u32,
@@ -34,11 +39,11 @@ pub(crate) struct Newcomer {
     pub outfit: Outfit,
 }
 
-/// A [`Perception`] with what the next set needs of the session.
+/// [`Perception`] with the state of the session that the next frame set needs.
 pub(crate) struct Perceiver {
     perception: Box<dyn Perception>,
     effort: Effort,
-    /// People of the session, and the numbers of their shapes.
+    /// People of the session, with the numbers of their shapes.
     known: Vec<(PersonId, u32)>,
 }
 
@@ -47,27 +52,27 @@ impl Perceiver {
         Self { perception, effort: Effort::FULL, known: Vec::new() }
     }
 
-    /// Chooses the work for the next set, and whom the session knows.
+    /// Chooses the work for the next frame set, and states the people whom the session knows.
     pub fn ready(&mut self, effort: Effort, known: Vec<(PersonId, u32)>) {
         (self.effort, self.known) = (effort, known);
     }
 
-    /// See [`Perception::measure_again`].
+    /// Calls [`Perception::measure_again`].
     pub fn measure_again(&mut self) -> bool {
         self.perception.measure_again()
     }
 
-    /// See [`Perception::move_camera`].
+    /// Calls [`Perception::move_camera`].
     pub fn move_camera(&mut self, slot: usize, camera: &Camera, plate: Option<&Image>) -> Result<(), FusionError> {
         self.perception.move_camera(slot, camera, plate)
     }
 
-    /// See [`Perception::work_beside`].
+    /// Calls [`Perception::work_beside`].
     pub fn work_beside(&mut self) {
         self.perception.work_beside();
     }
 
-    /// Observes everybody in a set.
+    /// Observes all people in a frame set.
     ///
     /// # Errors
     /// Those of [`Perception::observe`].
@@ -79,7 +84,7 @@ impl Perceiver {
         Ok(Perceived::People { observations, newcomers, effort: self.effort, stages, took: start.elapsed() })
     }
 
-    /// People whom perception knows but who are not among `known` in this shape.
+    /// Returns the people whom perception knows but who are not among `known` in this shape.
     pub fn newcomers(&self, known: &[(PersonId, u32)]) -> Vec<Newcomer> {
         let people = self.perception.people().into_iter();
         let is_new = |found: &KnownPerson<'_>| !known.contains(&(found.person, found.shape));
@@ -97,7 +102,7 @@ impl Default for Perceiver {
     }
 }
 
-/// Finds nobody.
+/// Perception that finds no person.
 struct Nobody;
 
 impl Perception for Nobody {
@@ -105,7 +110,7 @@ impl Perception for Nobody {
         Vec::new()
     }
 
-    fn observe(&mut self, _: &FrameSet, _: &mut StageTimes) -> Result<Vec<Observation>, FusionError> {
+    fn observe(&mut self, _: &FrameSet, _: &mut StageTimes) -> Result<Vec<PersonObservation>, FusionError> {
         Ok(Vec::new())
     }
 }

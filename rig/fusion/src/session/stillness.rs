@@ -1,35 +1,39 @@
-//! Scenes in which nothing moves.
+//! Detection of scenes in which nothing moves.
+//!
+//! Means of blocks of the images are compared with those at the last movement. While nothing moves, a frame set is processed each time
+//! eight times its cost has passed.
 
 use std::time::Duration;
 
 use flyrig_types::{FrameSet, Image};
 
-/// Rows, and bytes of a row, whose mean is compared: wide enough that the noise of a sensor averages out.
+/// Rows of a block whose mean is compared: enough that the noise of a sensor averages out.
 const BLOCK_ROWS: usize = 16;
+/// Bytes of each row of a block.
 const BLOCK_BYTES: usize = 48;
-/// Means that differ by more show movement, levels of 0 to 255. A contour of contrast 60 that moves by a pixel changes a block
-/// by 4.
+/// Largest difference of means without movement, levels of 0 to 255. A contour of contrast 60 that moves by a pixel changes a block by 4.
 const LIMIT: f32 = 2.0;
-/// Sets without movement that are taken in all the same: shape and colours settle, or a search looks everywhere.
+/// Frame sets without movement that are processed all the same, until shape and colours have settled.
 const SETTLE: u32 = 10;
+/// Frame sets without movement that are processed while no person is known, until a search has covered everything.
 const SETTLE_SEARCH: u32 = 40;
-/// Then one set is taken in each time its cost has passed so often.
+/// Pause after a frame set that was processed at rest, as a multiple of its cost.
 const REST: u32 = 8;
 
-/// Compares the images of each set with those at the last movement.
+/// Comparison of each frame set's images with those at the last movement.
 #[derive(Debug, Clone, Default)]
 pub(crate) struct Stillness {
-    /// Means of blocks at the last movement, by slot; `None` without an image.
+    /// Means of blocks at the last movement, one element per slot; `None` without an image.
     seen: Vec<Option<Vec<f32>>>,
-    /// Sets since then.
+    /// Frame sets since then.
     still: u32,
-    /// Time of the next set that is taken in although nothing moves.
+    /// Time of the next frame set that is processed although nothing moves, nanoseconds.
     next_nanos: i64,
 }
 
 impl Stillness {
-    /// Returns whether the set may be left out: nothing has moved for a while, and it is not yet time for another look.
-    pub fn may_rest(&mut self, set: &FrameSet, has_people: bool) -> bool {
+    /// Returns whether a frame set can be left out: nothing has moved for a while, and the pause is not over.
+    pub fn can_skip(&mut self, set: &FrameSet, has_people: bool) -> bool {
         let means: Vec<Option<Vec<f32>>> =
             set.frames.iter().map(|frame| frame.as_ref().map(|frame| block_means(&frame.image))).collect();
         let moved = means.len() != self.seen.len() || means.iter().zip(&self.seen).any(|(now, seen)| differ(now, seen));
@@ -41,8 +45,8 @@ impl Stillness {
         self.still > if has_people { SETTLE } else { SETTLE_SEARCH } && set.master_nanos < self.next_nanos
     }
 
-    /// A set was taken in.
-    pub fn taken_in(&mut self, nanos: i64, cost: Duration) {
+    /// Notes that a frame set was processed, and how long that took.
+    pub fn ingested(&mut self, nanos: i64, cost: Duration) {
         let pause = i64::try_from(cost.as_nanos()).unwrap_or(i64::MAX).saturating_mul(i64::from(REST));
         self.next_nanos = nanos.saturating_add(pause);
     }
@@ -111,12 +115,12 @@ mod tests {
         FrameSet { index, master_nanos, frames: (0..cameras).map(|i| Some(Arc::new(frame(i)))).collect() }
     }
 
-    /// Indices of the sets that are taken in.
+    /// Returns the indices of the frame sets that are processed.
     fn taken(stillness: &mut Stillness, sets: impl IntoIterator<Item = FrameSet>, has_people: bool) -> Vec<u64> {
         let mut taken = Vec::new();
         for set in sets {
-            if !stillness.may_rest(&set, has_people) {
-                stillness.taken_in(set.master_nanos, COST);
+            if !stillness.can_skip(&set, has_people) {
+                stillness.ingested(set.master_nanos, COST);
                 taken.push(set.index);
             }
         }
@@ -149,10 +153,10 @@ mod tests {
         assert!(taken(&mut stillness, (0..30).map(|i| set(i, 2, 40.0, 0)), true).len() < 20);
         let mut without = set(30, 2, 40.0, 0);
         without.frames[1] = None;
-        assert!(!stillness.may_rest(&without, true), "a camera went");
-        assert!(!stillness.may_rest(&set(31, 2, 40.0, 0), true), "a camera came");
-        assert!(!stillness.may_rest(&set(32, 3, 40.0, 0), true), "another number of cameras");
-        assert!(!stillness.may_rest(&FrameSet { index: 33, master_nanos: 0, frames: Vec::new() }, true));
+        assert!(!stillness.can_skip(&without, true), "a camera went");
+        assert!(!stillness.can_skip(&set(31, 2, 40.0, 0), true), "a camera came");
+        assert!(!stillness.can_skip(&set(32, 3, 40.0, 0), true), "another number of cameras");
+        assert!(!stillness.can_skip(&FrameSet { index: 33, master_nanos: 0, frames: Vec::new() }, true));
     }
 
     #[test]
@@ -160,7 +164,7 @@ mod tests {
         let mut stillness = Stillness::default();
         let search = taken(&mut stillness, (0..60).map(|i| set(i, 1, 40.0, 0)), false);
         assert!(search.contains(&u64::from(SETTLE_SEARCH)) && search.len() < 50, "{search:?}");
-        stillness.taken_in(i64::MAX, Duration::MAX);
-        assert!(stillness.may_rest(&set(61, 1, 40.0, 0), false));
+        stillness.ingested(i64::MAX, Duration::MAX);
+        assert!(stillness.can_skip(&set(61, 1, 40.0, 0), false));
     }
 }

@@ -1,29 +1,29 @@
-//! How much work a set gets.
+//! Level of effort: the work that a frame set gets.
 
 use serde::Serialize;
 
-/// Work on a set. Whatever is left out costs accuracy; docs/benchmarks/budget.md has the prices.
+/// Work that a frame set gets. Everything that is left out costs accuracy; docs/benchmarks/budget.md has the prices.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize)]
 pub struct Effort {
-    /// Views with an earlier look that the pose network looks at again at most; 0: all in which the body has moved.
+    /// Largest number of views on which the pose network runs again; 0: all in which the body has moved.
     pub looks: usize,
-    /// Crops of an image that a search for a person looks at; 0: all.
+    /// Crops of an image on which the network runs in a search for a person; 0: all.
     pub search_crops: usize,
-    /// Rounds in which the pose is matched with outlines and texture, at most.
+    /// Largest number of rounds in which the pose is matched with outlines and texture.
     pub rounds: usize,
     /// Whether coverage and colours along outlines are solved for.
     pub mattes: bool,
-    /// Sets from one solve of the deformation to the next.
+    /// Frame sets from one solve of the deformation to the next.
     pub solve_every: u32,
-    /// Sets from one painting to the next, networks included.
+    /// Frame sets from one painting to the next, networks included.
     pub paint_every: u32,
 }
 
 impl Effort {
-    /// Everything, in every set.
+    /// All work in every frame set.
     pub const FULL: Self = Self { looks: 0, search_crops: 3, rounds: 2, mattes: true, solve_every: 1, paint_every: 1 };
 
-    /// Levels from everything to little. Each gives up what costs the fewest decibels for a millisecond.
+    /// Levels from all work to little. Each gives up what costs the fewest decibels per millisecond.
     pub const LEVELS: [Self; 7] = {
         let mut levels = [Self::FULL; 7];
         levels[1] = Self { mattes: false, ..levels[0] };

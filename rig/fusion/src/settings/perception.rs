@@ -1,4 +1,4 @@
-//! The table `[perception]`.
+//! Table `[perception]`: the sources of poses, shapes and masks.
 
 use std::path::PathBuf;
 
@@ -7,8 +7,8 @@ use clap::{Args, ValueEnum};
 use flyrig_tracker::KeyColor;
 use serde::{Deserialize, Serialize};
 
-use super::check;
-use crate::FusionError;
+use super::range::check;
+use crate::error::FusionError;
 
 /// Source of a pose, a shape or a mask.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize, ValueEnum)]
@@ -21,10 +21,10 @@ pub enum Origin {
     Estimated,
 }
 
-/// Where poses, shapes and masks of people come from, and how people are found.
+/// Settings of perception: the sources of poses, shapes and masks, and the search for people.
 ///
-/// A configuration estimates everything by default. The options of commands that replay data sets take what comes with the
-/// data by default.
+/// A configuration estimates everything by default. The options of commands that replay data sets default to the poses, shapes and masks
+/// that come with the data.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize, Args)]
 #[serde(deny_unknown_fields, default)]
 pub struct PerceptionSettings {
@@ -34,14 +34,14 @@ pub struct PerceptionSettings {
     /// Masks from the data set, or from the images.
     #[arg(long, value_enum, default_value = "given")]
     pub masks: Origin,
-    /// Shape of the body from the data set's glTF file, or from the images; by default from where the pose comes.
+    /// Shape of the body from the data set's glTF file, or from the images; by default from the source of the pose.
     #[arg(long, value_enum)]
     pub shape: Option<Origin>,
     /// Fingers and the head's rotation: as the pose has them (with an estimated pose fingers are at rest), or from landmarks
     /// of hands and face in the images. The latter needs an estimated pose and a body with fingers, as the built-in one.
     #[arg(long, value_enum, default_value = "given")]
     pub hands: Origin,
-    /// People who are tracked at most, 1 to 4; with 1 the one whom most views agree on.
+    /// Largest number of tracked people, 1 to 4; with 1 the person on whom most views agree.
     #[arg(long, default_value_t = 1)]
     pub people: usize,
     /// Description of a landmark network to use in place of the one built in: a TOML file, see docs/guide/people.md. It needs
@@ -93,7 +93,7 @@ impl PerceptionSettings {
         Self { pose: Origin::Given, masks: Origin::Given, ..Self::default() }
     }
 
-    /// Where the shape comes from.
+    /// Returns the source of the shape.
     #[must_use]
     pub fn shape(&self) -> Origin {
         self.shape.unwrap_or(self.pose)

@@ -1,31 +1,37 @@
-//! Settings of a session. Each struct is a table of a configuration (serde) and a group of command-line options (clap).
+//! Settings of a session: all its tables.
 
-mod appearance;
-mod body;
-mod budget;
-mod perception;
-mod tracking;
+use super::{
+    appearance::AppearanceOptions, body::BodySettings, budget::BudgetSettings, perception::PerceptionSettings,
+    tracking::TrackingSettings,
+};
+use crate::error::FusionError;
 
-pub use appearance::{AppearanceMode, AppearanceOptions, NetworksOn};
-pub use body::BodySettings;
-pub use budget::BudgetSettings;
-pub use perception::{Origin, PerceptionSettings};
-pub use tracking::{Solver, TrackingSettings};
-
-use crate::FusionError;
-
-/// Everything that may be chosen about a session.
+/// Settings of a session.
+///
+/// # Example
+/// ```
+/// use flyrig_fusion::{BodySettings, SessionSettings};
+///
+/// let mut settings = SessionSettings { body: BodySettings::with_gaussians(12_000), ..SessionSettings::default() };
+/// settings.perception.people = 2;
+/// settings.validate()?;
+///
+/// settings.perception.people = 9;
+/// let error = settings.validate().unwrap_err().to_string();
+/// assert_eq!(error, "perception.people is 9, it must lie between 1 and 4");
+/// # Ok::<(), flyrig_fusion::FusionError>(())
+/// ```
 #[derive(Debug, Clone, PartialEq, Default)]
 pub struct SessionSettings {
-    /// Where poses and masks come from.
+    /// Sources of poses, shapes and masks.
     pub perception: PerceptionSettings,
-    /// The person's surface.
+    /// Surface of the person.
     pub body: BodySettings,
-    /// How the surface follows the images.
+    /// Deformation of the surface.
     pub tracking: TrackingSettings,
-    /// How Gaussians get their colours.
+    /// Colours of the Gaussians.
     pub appearance: AppearanceOptions,
-    /// How fast sets have to be taken in.
+    /// Frame rate to keep up with.
     pub budget: BudgetSettings,
 }
 
@@ -41,12 +47,4 @@ impl SessionSettings {
         self.budget.validate()?;
         self.appearance.validate()
     }
-}
-
-/// Checks that a value lies in a range.
-pub(crate) fn check(key: &str, value: f64, low: f64, high: f64) -> Result<(), FusionError> {
-    if (low..=high).contains(&value) {
-        return Ok(());
-    }
-    Err(FusionError::Setting(format!("{key} is {value}, it must lie between {low} and {high}")))
 }

@@ -1,159 +1,118 @@
-//! One person: the template, its Gaussians on the GPU, deformation, colours, and how well the person is tracked.
+//! One person: template, Gaussians on the GPU, deformation, colours and tracking quality.
+//!
+//! [`Subject::update`] reconstructs the person in one frame set:
+//!
+//! 1. [`inputs`] converts and uploads the images with the person's masks.
+//! 2. [`instants`] collects the poses at which the images were taken.
+//! 3. [`geometry`] solves the deformation against the images and skins the Gaussians at every instant.
+//! 4. [`painter`] renders canonical positions and the last colours into every view, and updates the colours from the pixels at the
+//!    surface; in the learned modes networks then correct them.
+//!
+//! Nothing waits between skinning and painting where the adapter has timestamps: [`stage_clock`] collects their times with the next
+//! wait. [`memory`] holds what outlives the subject, [`stream_frame`] what viewers get of it.
 
-use std::{sync::Arc, time::Instant};
+mod geometry;
+mod inputs;
+mod instants;
+pub(crate) mod memory;
+mod memory_file;
+mod painter;
+mod pose_curve;
+mod resume;
+mod schedule;
+mod stage_clock;
+pub(crate) mod stream_frame;
+mod surface;
+pub(crate) mod track_watch;
 
-use flyrig_body::{
-    BodyError, DEFAULT_SIGMA2_M2, DeformationGraph, GpuSkinner, Outfit, SurfaceGaussians, Template, build_graph,
-    sample_surface, skin_mesh,
-};
-use flyrig_capture::to_rgb8;
-use flyrig_gpu::{GpuContext, StageTimer, StorageBuffer};
-use flyrig_renderer::{
-    AppearanceSettings, ColorMatcher, DirectAppearance, GaussianBuffers, Observations, Outputs, RasterSettings,
-    Rasterizer, RenderTarget, Splat, UNKNOWN_RGBA, ViewInput, read_splats,
-};
-use flyrig_stfa::{BodyGraph, LearnedAppearance, Parameters, SharedAppearance, ViewImage};
+use std::sync::Arc;
+
+use flyrig_body::{Outfit, Template};
+use flyrig_gpu::GpuContext;
+use flyrig_renderer::{GaussianBuffers, Observations, Rasterizer, Splat, read_splats};
+use flyrig_stfa::BodyGraph;
 use flyrig_stream::EncodedTemplate;
-use flyrig_tracker::{DeformReport, EdgeColor};
-use flyrig_types::{Camera, Image, Mask, PersonId, Pose, Rig};
+use flyrig_tracker::DeformReport;
+use flyrig_types::{PersonId, Pose, Rig};
+use glam::{DVec3, Vec3};
 
 use crate::{
-    BodySettings, Effort, FusionError, NetworksOn, PersonMemory, SessionSettings, StageTimes, TrackWatch,
-    deformation::{DeformTimes, Deformation, Instants, TrackedView},
-    memory::NetworkMemory,
-    person_stream::encode_template,
-    pose_curve::PoseCurve,
-    stage_times::processor_time,
+    error::FusionError,
+    health::stage_times::StageTimes,
+    settings::{effort::Effort, session::SessionSettings},
 };
 
-/// Seed of the surface sampling: the same template gives the same Gaussians on every run.
-const SURFACE_SEED: u64 = 1;
-/// Stage of the processor time that the deformation took, over all threads of the process.
-pub const PROCESSOR_STAGE: &str = "  processor";
-/// Stages of an update that the adapter times.
-const TIMED_STAGES: [&str; 3] = ["skinning", "visibility", "appearance"];
-/// Updates of a person who was just met that get all the work.
-const FULL_UPDATES: u32 = 10;
-/// Coverage by other people from which a pixel says nothing about this person.
-const OTHERS_COVER: u8 = 128;
+pub use geometry::PROCESSOR_STAGE;
+pub(crate) use inputs::InputView;
+pub use surface::{person_gaussians, person_surface};
 
-/// One image of a set with one person's mask.
-#[derive(Debug, Clone, Copy)]
-pub(crate) struct InputView<'a> {
-    pub camera: &'a Camera,
-    pub image: &'a Image,
-    pub mask: &'a Mask,
-    /// Colours of the mask's outline without the background's share.
-    pub edge_colors: &'a [EdgeColor],
-    /// Coverage by other people.
-    pub others: Option<&'a Mask>,
-    /// Pose at the image's own time, where that is not the set's.
-    pub pose: Option<&'a Pose>,
-}
+use geometry::Geometry;
+use inputs::{InputImage, Inputs};
+use instants::Instants;
+use memory::PersonMemory;
+use painter::{GaussianPainter, PaintInputs};
+use pose_curve::PoseCurve;
+use schedule::Schedule;
+use stage_clock::StageClock;
+use stream_frame::encode_template;
+use track_watch::TrackWatch;
 
-/// An image as the kernels read it.
-#[derive(Debug)]
-struct InputImage {
-    size: [u32; 2],
-    /// sRGB with the person's coverage, row by row.
-    rgba: Vec<u8>,
-    /// The same on the GPU, a pixel an element.
-    words: StorageBuffer<u32>,
-    /// Of the camera that took it; `None` where its colours stay as they are.
-    matcher: Option<ColorMatcher>,
-}
-
-/// The inputs and results of a person's last update, read back: the raw material of training samples.
+/// Inputs and results of a person's last update, read back: the raw material of training samples.
 #[derive(Debug)]
 pub struct Observed {
-    /// Of direct appearance, by observing view.
+    /// Observations of direct appearance, one element per observing view.
     pub observations: Observations,
     /// Slots of the observing views' cameras.
     pub slots: Vec<usize>,
-    /// The observing views: width, height, and pixels with the mask as alpha.
+    /// Images of the observing views: width, height, and sRGB pixels with the mask as alpha.
     pub pictures: Vec<(u32, u32, Vec<u8>)>,
-    /// World centre, metres; w: scale.
+    /// World centre of each Gaussian, metres; w: scale.
     pub center_scale: Vec<[f32; 4]>,
-    /// World normal; w: depth below the drawn surface, metres.
+    /// World normal of each Gaussian; w: depth below the rendered surface, metres.
     pub normal: Vec<[f32; 4]>,
 }
 
-/// The networks, by device.
+/// Shape of a person, with and without clothes.
 #[derive(Debug)]
-enum Networks {
-    Processor(Box<LearnedAppearance>),
-    Adapter(SharedAppearance),
+struct PersonShape {
+    /// Template that is posed and drawn: dressed.
+    template: Template,
+    /// Body below the clothes, and the clothes; `None` without any.
+    undressed: Option<(Template, Outfit)>,
+    /// Template of the person stream, for viewers that draw the person themselves.
+    stream: Arc<EncodedTemplate>,
 }
 
-/// One person as Gaussians on the GPU, with everything that belongs to the person: shape, pose track, deformation, colour
-/// memory and tracking quality.
+/// Pose and tracking quality over the frame sets.
+#[derive(Debug, Default)]
+pub(crate) struct PersonTrack {
+    /// Last poses, for the times between and shortly after them.
+    pub curve: PoseCurve,
+    pub watch: TrackWatch,
+    pub last_pose: Option<Pose>,
+    /// Confidence in the last pose, 0..=1.
+    pub confidence: f64,
+    /// Slots of the views that the last update used.
+    pub viewed: Vec<usize>,
+}
+
+/// One person as Gaussians on the GPU, with shape, deformation, colour memory and tracking quality.
 #[derive(Debug)]
 pub struct Subject {
     id: PersonId,
     /// Number of the shape, see [`crate::KnownPerson`].
-    pub(crate) shape: u32,
-    /// As it is drawn: with its clothes.
-    template: Template,
-    /// The body below the clothes, and these; `None` without any.
-    undressed: Option<(Template, Outfit)>,
-    /// The same for those who draw the person themselves.
-    stream_template: Arc<EncodedTemplate>,
-    skinner: GpuSkinner,
-    gaussians: GaussianBuffers,
-    /// The Gaussians as they stood at the second, third ... instant of a set.
-    posed: Vec<GaussianBuffers>,
-    appearance: DirectAppearance,
-    settings: AppearanceSettings,
-    body: BodyGraph,
-    networks: Option<Networks>,
-    /// Of [`TIMED_STAGES`].
-    timer: StageTimer,
-    /// Views that painted in the last update.
-    painted: Vec<usize>,
-    /// A target an input view; grows with the rig, remade when an image's size changes.
-    visibility: Vec<RenderTarget>,
-    inputs: Vec<InputImage>,
-    deformation: Option<Deformation>,
-    /// Whether the deformation is suspended.
-    pub(crate) shape_held: bool,
-    /// Colours of direct appearance, while the Gaussians show those of the networks.
-    direct_colors: Option<StorageBuffer<[f32; 4]>>,
-    /// Agreement of the deformation with the views that it was solved for last.
-    judged: Vec<Option<(f64, bool)>>,
-    /// Updates since the person was met.
-    updates: u32,
+    pub(crate) shape_number: u32,
+    shape: PersonShape,
+    /// Deformation graph as the networks see it.
+    body_graph: BodyGraph,
+    inputs: Inputs,
+    geometry: Geometry,
+    painter: GaussianPainter,
+    schedule: Schedule,
+    clock: StageClock,
     /// Shape and colours that the person starts with, where they are known before the first image.
     start: Option<Arc<PersonMemory>>,
-    /// Times of the last poses that were used, for what lies between and beyond them.
-    pub(crate) curve: PoseCurve,
-    pub(crate) watch: TrackWatch,
-    pub(crate) last_pose: Option<Pose>,
-    /// Confidence in the last pose, 0..=1.
-    pub(crate) confidence: f64,
-    /// Slots of the views that the last update took in.
-    pub(crate) viewed: Vec<usize>,
-}
-
-/// Samples a template's Gaussians as a [`Subject`] does, on the surface.
-///
-/// # Errors
-/// [`BodyError`] for a template that is not valid.
-pub fn person_gaussians(template: &Template, body: &BodySettings) -> Result<SurfaceGaussians, BodyError> {
-    sample_surface(template, body.gaussians, SURFACE_SEED)
-}
-
-/// Samples a template's Gaussians as a [`Subject`] does, and the graph that deforms them. Where it is deformed, they are drawn
-/// [inset](SurfaceGaussians::inset).
-///
-/// # Errors
-/// [`BodyError`] for a template that is not valid.
-pub fn person_surface(
-    template: &Template,
-    body: &BodySettings,
-) -> Result<(SurfaceGaussians, DeformationGraph), BodyError> {
-    let surface = person_gaussians(template, body)?;
-    let graph = build_graph(template, &surface, body.nodes, DEFAULT_SIGMA2_M2)?;
-    Ok((surface, graph))
+    pub(crate) track: PersonTrack,
 }
 
 impl Subject {
@@ -161,199 +120,38 @@ impl Subject {
     pub(crate) fn new(
         gpu: &GpuContext,
         id: PersonId,
-        (shape, outfit): (Template, Outfit),
+        (body, outfit): (Template, Outfit),
         rig: &Rig,
         settings: &SessionSettings,
     ) -> Result<Self, FusionError> {
-        let body = &settings.body;
-        let template = outfit.on(&shape)?;
-        let (surface, graph) = person_surface(&template, body)?;
-        let mut subject = Self::from_parts(gpu, id, template, &surface, &graph, rig, settings)?;
-        subject.undressed = (!outfit.is_bare()).then_some((shape, outfit));
-        if let Some(networks) = settings.appearance.load_networks()? {
-            subject.use_networks(gpu, &networks, settings)?;
-        }
-        Ok(subject)
-    }
-
-    fn from_parts(
-        gpu: &GpuContext,
-        id: PersonId,
-        template: Template,
-        surface: &SurfaceGaussians,
-        graph: &DeformationGraph,
-        rig: &Rig,
-        settings: &SessionSettings,
-    ) -> Result<Self, FusionError> {
-        let count = surface.positions.len();
-        let gaussians = GaussianBuffers::zeroed(gpu, count)?;
-        let center_scale: Vec<[f32; 4]> =
-            surface.positions.iter().zip(&surface.scale_m).map(|(p, s)| p.extend(*s).to_array()).collect();
-        gaussians.center_scale.write(gpu, &center_scale);
-        let canonical: Vec<[f32; 4]> = surface.positions.iter().map(|p| p.extend(1.0).to_array()).collect();
-        gaussians.canonical.write(gpu, &canonical);
-        gaussians.color.write(gpu, &vec![[0.5, 0.5, 0.5, 1.0]; count]);
-        let deform = settings.tracking.options();
-        let inset = deform.as_ref().map(|_| surface.inset());
-        let drawn = inset.as_ref().unwrap_or(surface);
-        let stream_template = encode_template(drawn, deform.as_ref().map(|_| graph), &template.skeleton)?;
+        let template = outfit.on(&body)?;
+        let (surface, graph) = person_surface(&template, &settings.body)?;
+        let is_deformed = settings.tracking.options().is_some();
+        let inset = is_deformed.then(|| surface.inset());
+        let rendered = inset.as_ref().unwrap_or(&surface);
+        let stream = encode_template(rendered, is_deformed.then_some(&graph), &template.skeleton)?;
+        let body_graph = BodyGraph::new(&surface, &graph)?;
         Ok(Self {
             id,
-            shape: 0,
-            stream_template: Arc::new(stream_template),
-            skinner: GpuSkinner::new(gpu, drawn, &template.skeleton)?,
-            shape_held: false,
-            direct_colors: None,
-            deformation: deform
-                .map(|options| Deformation::new(gpu, &template, surface, graph, options, finest_pixel_m(rig)))
-                .transpose()?,
-            appearance: DirectAppearance::new(gpu, surface, graph, rig.cameras.len())?,
-            body: BodyGraph::new(surface, graph)?,
-            networks: None,
-            timer: StageTimer::new(gpu, TIMED_STAGES.len() as u32),
-            painted: Vec::new(),
-            template,
-            undressed: None,
-            gaussians,
-            settings: settings.appearance.mode.settings(),
-            posed: Vec::new(),
-            judged: Vec::new(),
-            updates: 0,
+            shape_number: 0,
+            geometry: Geometry::new(gpu, &template, (&surface, rendered), &graph, rig, settings)?,
+            painter: GaussianPainter::new(gpu, &surface, &graph, &body_graph, rig.cameras.len(), settings)?,
+            shape: PersonShape {
+                template,
+                undressed: (!outfit.is_bare()).then_some((body, outfit)),
+                stream: Arc::new(stream),
+            },
+            body_graph,
+            inputs: Inputs::default(),
+            schedule: Schedule::default(),
+            clock: StageClock::new(gpu),
             start: None,
-            visibility: Vec::new(),
-            inputs: Vec::new(),
-            curve: PoseCurve::default(),
-            watch: TrackWatch::default(),
-            last_pose: None,
-            confidence: 0.0,
-            viewed: Vec::new(),
+            track: PersonTrack::default(),
         })
     }
 
-    /// Which person this is.
-    #[must_use]
-    pub fn id(&self) -> PersonId {
-        self.id
-    }
-
-    /// The template that is posed.
-    #[must_use]
-    pub fn template(&self) -> &Template {
-        &self.template
-    }
-
-    /// The body's shape without its clothes.
-    #[must_use]
-    pub fn body(&self) -> &Template {
-        self.undressed.as_ref().map_or(&self.template, |(shape, _)| shape)
-    }
-
-    /// The body's shape without clothes, and these.
-    pub(crate) fn shape_and_outfit(&self) -> (Template, Outfit) {
-        match &self.undressed {
-            Some((shape, outfit)) => (shape.clone(), *outfit),
-            None => (self.template.clone(), Outfit::default()),
-        }
-    }
-
-    /// How well the person is tracked.
-    #[must_use]
-    pub fn watch(&self) -> &TrackWatch {
-        &self.watch
-    }
-
-    /// Pose of the last update.
-    #[must_use]
-    pub fn pose(&self) -> Option<&Pose> {
-        self.last_pose.as_ref()
-    }
-
-    /// Confidence in the last observed pose, 0..=1.
-    #[must_use]
-    pub fn confidence(&self) -> f64 {
-        self.confidence
-    }
-
-    /// The template for the person stream.
-    pub(crate) fn stream_template(&self) -> Arc<EncodedTemplate> {
-        Arc::clone(&self.stream_template)
-    }
-
-    /// Canonical translations of the deformation graph's nodes, metres; empty without a deformation.
-    #[must_use]
-    pub fn node_translations(&self) -> &[glam::DVec3] {
-        self.deformation.as_ref().map_or(&[], Deformation::translations)
-    }
-
-    /// The Gaussians as they are drawn.
-    pub(crate) fn gaussians(&self) -> &GaussianBuffers {
-        &self.gaussians
-    }
-
-    fn use_networks(
-        &mut self,
-        gpu: &GpuContext,
-        parameters: &Parameters,
-        settings: &SessionSettings,
-    ) -> Result<(), FusionError> {
-        self.appearance.keep_observations(gpu)?;
-        self.networks = Some(match settings.appearance.networks_on {
-            NetworksOn::Processor => {
-                let mut learned = LearnedAppearance::new(parameters, self.body.clone());
-                learned.reuse = settings.appearance.reuse;
-                Networks::Processor(Box::new(learned))
-            }
-            NetworksOn::Adapter => Networks::Adapter(SharedAppearance::new(gpu, parameters, &self.body)?),
-        });
-        let direct = StorageBuffer::zeroed(gpu, "direct colours", self.gaussians.count())?;
-        self.gaussians.color.copy_to(gpu, &direct);
-        self.direct_colors = Some(direct);
-        Ok(())
-    }
-
-    /// Keeps what each view saw from the next update on, for [`Self::observed`].
-    pub(crate) fn keep_observations(&mut self, gpu: &GpuContext) -> Result<(), FusionError> {
-        Ok(self.appearance.keep_observations(gpu)?)
-    }
-
-    /// The deformation graph as the networks see it.
-    #[must_use]
-    pub fn body_graph(&self) -> &BodyGraph {
-        &self.body
-    }
-
-    /// sRGB of an input view of the last update with the person's mask as alpha, in the order of
-    /// [`crate::Session::viewed`].
-    #[must_use]
-    pub fn input(&self, view: usize) -> &[u8] {
-        self.inputs.get(view).map_or(&[], |input| &input.rgba)
-    }
-
-    pub(crate) fn observed(&self, gpu: &GpuContext) -> Result<Observed, FusionError> {
-        let picture = |&i: &usize| {
-            let InputImage { size: [width, height], rgba, .. } = &self.inputs[i];
-            (*width, *height, rgba.clone())
-        };
-        Ok(Observed {
-            observations: self.appearance.observations(gpu, self.painted.len())?,
-            slots: self.painted.iter().filter_map(|&i| self.viewed.get(i).copied()).collect(),
-            pictures: self.painted.iter().map(picture).collect(),
-            center_scale: self.gaussians.center_scale.read(gpu)?,
-            normal: self.gaussians.normal.read(gpu)?,
-        })
-    }
-
-    /// Whether the person was just met, and gets all the work at whatever level of effort.
-    pub(crate) fn is_new(&self) -> bool {
-        (1..=FULL_UPDATES).contains(&self.updates)
-    }
-
-    /// Other cameras give images now than in the last update.
-    pub(crate) fn views_changed(&mut self) {
-        self.judged.clear();
-    }
-
-    /// Takes in one instant: pose, then colours from the views. A view whose mask is empty adds nothing.
+    /// Reconstructs the person in one frame set: deformation, Gaussians, then colours from the views. A view whose mask is empty adds
+    /// nothing.
     pub(crate) fn update(
         &mut self,
         gpu: &GpuContext,
@@ -363,422 +161,167 @@ impl Subject {
         effort: Effort,
         stages: &mut StageTimes,
     ) -> Result<(), FusionError> {
-        // Somebody who was just met needs all the work: whatever comes later builds on it.
-        let turn = self.updates.saturating_sub(FULL_UPDATES);
-        self.updates = self.updates.saturating_add(1);
-        let solves = turn.is_multiple_of(effort.solve_every);
-        // Half a cycle later, so that neighbouring sets cost about the same.
-        let paints = turn == 0 || (turn + effort.paint_every / 2).is_multiple_of(effort.paint_every);
-        stages.time("convert images", || self.take_images(gpu, views))?;
+        let work = self.schedule.next(effort);
+        stages.time("convert images", || self.inputs.upload(gpu, views))?;
         // One update at a time is under way, and none while the processor's time is measured.
         gpu.wait()?;
-        self.collect_times(stages);
+        self.clock.collect(stages);
 
-        // The instant itself, and each other one that an image was taken at.
-        let mut instants = vec![pose];
-        let instant_of: Vec<usize> = views
-            .iter()
-            .map(|view| {
-                let Some(own) = view.pose else { return 0 };
-                instants.iter().position(|known| *known == own).unwrap_or_else(|| {
-                    instants.push(own);
-                    instants.len() - 1
-                })
-            })
-            .collect();
-        while self.posed.len() + 1 < instants.len() {
-            self.posed.push(self.gaussians.posed_again(gpu)?);
+        let skeleton = &self.shape.template.skeleton;
+        let instants = Instants::new(pose, views);
+        self.geometry.reserve(gpu, instants.poses().len())?;
+        if work.solves {
+            self.geometry.deform(gpu, skeleton, &instants, views, &self.inputs, stages)?;
         }
-        let poses = instants;
-        let instants: Vec<(&Pose, &GaussianBuffers)> =
-            poses.iter().copied().zip(std::iter::once(&self.gaussians).chain(&self.posed)).collect();
-
-        let solves = solves && !views.is_empty() && !self.shape_held;
-        if solves || self.shape_held {
-            self.judged.clear();
-        }
-        if let Some(deformation) = self.deformation.as_mut().filter(|_| solves) {
-            let (start, processor) = (Instant::now(), processor_time());
-            let tracked: Vec<TrackedView<'_>> = views
-                .iter()
-                .zip(&self.inputs)
-                .zip(&instant_of)
-                .map(|((view, input), &instant)| TrackedView {
-                    camera: view.camera,
-                    size: input.size,
-                    rgba: &input.rgba,
-                    words: &input.words,
-                    with_unknown: view.others.is_some(),
-                    instant,
-                })
-                .collect();
-            let scene = Instants { gpu, skeleton: &self.template.skeleton, poses: &poses, gaussians: &self.gaussians };
-            let DeformTimes { prepare, draw, derivatives, solve } = deformation.track(scene, &tracked)?;
-            self.judged.extend_from_slice(deformation.judged());
-            stages.add("deformation", start.elapsed());
-            stages.add("  prepare", prepare);
-            stages.add("  draw and compare", draw);
-            stages.add("  derivatives", derivatives);
-            stages.add("  solve", solve);
-            stages.add_processor_time(PROCESSOR_STAGE, processor_time().saturating_sub(processor));
-            let at_rest = deformation.report().is_some_and(|report| report.at_rest);
-            stages.count("frames at rest, not solved", u64::from(at_rest));
-            let left_out = deformation.judged().iter().filter(|judged| judged.is_none()).count();
-            stages.count("views not compared", left_out as u64);
-            let distrusted = deformation.judged().iter().flatten().filter(|(_, trusted)| !trusted).count();
-            stages.count("views not believed", distrusted as u64);
-            stages.count("images halved", deformation.halved_images() as u64);
-        }
-
-        let start = Instant::now();
-        let displacement = self.deformation.as_ref().map(Deformation::displacement);
-        for (i, (pose, gaussians)) in instants.iter().enumerate() {
-            let mut encoder = gpu.device.create_command_encoder(&Default::default());
-            if i == 0 {
-                self.timer.begin(&mut encoder);
-            }
-            let (centers, normals) = (&gaussians.center_scale, &gaussians.normal);
-            let skeleton = &self.template.skeleton;
-            self.skinner.encode(gpu, &mut encoder, skeleton, pose, displacement, centers, normals)?;
-            if i + 1 == instants.len() {
-                self.timer.mark(&mut encoder, TIMED_STAGES[0]);
-            }
-            gpu.queue.submit([encoder.finish()]);
-        }
-        // Waits that only a clock on this side needs.
-        let has_timer = self.timer.is_supported();
-        if !has_timer {
-            gpu.wait()?;
-            stages.add(TIMED_STAGES[0], start.elapsed());
-        }
-
-        self.painted.clear();
-        if !paints {
+        self.geometry.skin(gpu, skeleton, &instants, &mut self.clock, stages)?;
+        if !work.paints {
+            self.painter.skip();
             stages.count("sets not painted", 1);
             return Ok(());
         }
-        if let Some(direct) = &self.direct_colors {
-            // Direct appearance goes on from its own colours.
-            direct.copy_to(gpu, &self.gaussians.color);
-        }
-        let start = Instant::now();
-        for (i, view) in views.iter().enumerate() {
-            let (width, height) = (view.image.width(), view.image.height());
-            let fits = self.visibility.get(i).is_some_and(|t| (t.width, t.height) == (width, height));
-            if !fits {
-                let target = RenderTarget::new(gpu, width, height)?;
-                if i < self.visibility.len() {
-                    self.visibility[i] = target;
-                } else {
-                    self.visibility.push(target);
-                }
-            }
-            let settings = RasterSettings {
-                outputs: Outputs { color: true, depth: false, canonical: true },
-                ..RasterSettings::default()
-            };
-            let mut encoder = gpu.device.create_command_encoder(&Default::default());
-            rasterizer.encode(
-                gpu,
-                &mut encoder,
-                instants[instant_of[i]].1,
-                view.camera,
-                &settings,
-                &self.visibility[i],
-            )?;
-            if i + 1 == views.len() {
-                self.timer.mark(&mut encoder, TIMED_STAGES[1]);
-            }
-            gpu.queue.submit([encoder.finish()]);
-        }
-        if !has_timer {
-            gpu.wait()?;
-            stages.add(TIMED_STAGES[1], start.elapsed());
-        }
-
-        let start = Instant::now();
-        // A view that is not believed paints nothing.
-        let believed = |i: usize| self.judged.get(i).copied().flatten().is_none_or(|(_, trusted)| trusted);
-        self.painted = (0..views.len()).filter(|&i| believed(i)).collect();
-        let inputs: Vec<ViewInput<'_>> = self
-            .painted
-            .iter()
-            .map(|&i| ViewInput {
-                camera: views[i].camera,
-                picture: &self.inputs[i].words,
-                canonical: &self.visibility[i].canonical,
-                drawn: &self.visibility[i].color,
-                gaussians: (instant_of[i] > 0).then(|| instants[instant_of[i]].1),
-            })
-            .collect();
-        let mut encoder = gpu.device.create_command_encoder(&Default::default());
-        if views.is_empty() {
-            self.timer.mark(&mut encoder, TIMED_STAGES[1]);
-        }
-        self.appearance.update(gpu, &mut encoder, &self.gaussians, &inputs, &self.settings)?;
-        self.timer.mark(&mut encoder, TIMED_STAGES[2]);
-        self.timer.finish(&mut encoder);
-        gpu.queue.submit([encoder.finish()]);
-        if !has_timer || self.networks.is_some() {
-            gpu.wait()?;
-        }
-        if !has_timer {
-            stages.add(TIMED_STAGES[2], start.elapsed());
-        }
-        self.paint_learned(gpu, stages)
+        let (geometry, instants, images) = (&self.geometry, &instants, &self.inputs);
+        let inputs = PaintInputs { gpu, geometry, instants, views, images };
+        self.painter.paint(inputs, rasterizer, &mut self.clock, stages)
     }
 
     /// Adds the adapter's times of updates that were waited for.
     pub(crate) fn collect_times(&mut self, stages: &mut StageTimes) {
-        for stage in self.timer.collect() {
-            stages.add_of_adapter(stage.name, stage.time);
-        }
+        self.clock.collect(stages);
     }
 
-    /// Lets the networks add to what direct appearance painted.
-    fn paint_learned(&mut self, gpu: &GpuContext, stages: &mut StageTimes) -> Result<(), FusionError> {
-        let Some(networks) = &mut self.networks else { return Ok(()) };
-        let start = Instant::now();
-        if let Some(direct) = &self.direct_colors {
-            self.gaussians.color.copy_to(gpu, direct);
-        }
+    /// Returns the person's id.
+    #[must_use]
+    pub fn id(&self) -> PersonId {
+        self.id
+    }
+
+    /// Returns the template that is posed: dressed.
+    #[must_use]
+    pub fn template(&self) -> &Template {
+        &self.shape.template
+    }
+
+    /// Returns the body without its clothes.
+    #[must_use]
+    pub fn body(&self) -> &Template {
+        self.shape.undressed.as_ref().map_or(&self.shape.template, |(body, _)| body)
+    }
+
+    /// Returns the person's clothes.
+    pub(crate) fn outfit(&self) -> Outfit {
+        self.shape.undressed.as_ref().map_or_else(Outfit::default, |(_, outfit)| *outfit)
+    }
+
+    /// Returns the tracking quality.
+    #[must_use]
+    pub fn watch(&self) -> &TrackWatch {
+        &self.track.watch
+    }
+
+    /// Returns the pose of the last update.
+    #[must_use]
+    pub fn pose(&self) -> Option<&Pose> {
+        self.track.last_pose.as_ref()
+    }
+
+    /// Returns the confidence in the last observed pose, 0..=1.
+    #[must_use]
+    pub fn confidence(&self) -> f64 {
+        self.track.confidence
+    }
+
+    /// Returns the template for the person stream.
+    pub(crate) fn stream_template(&self) -> Arc<EncodedTemplate> {
+        Arc::clone(&self.shape.stream)
+    }
+
+    /// Returns the canonical translations of the deformation graph's nodes, metres; empty without a deformation.
+    #[must_use]
+    pub fn node_translations(&self) -> &[DVec3] {
+        self.geometry.node_translations()
+    }
+
+    /// Returns the Gaussians as they are drawn.
+    pub(crate) fn gaussians(&self) -> &GaussianBuffers {
+        self.geometry.gaussians()
+    }
+
+    /// Keeps what each view observes from the next update on, for [`Self::observed`].
+    pub(crate) fn keep_observations(&mut self, gpu: &GpuContext) -> Result<(), FusionError> {
+        self.painter.keep_observations(gpu)
+    }
+
+    /// Returns the deformation graph as the networks see it.
+    #[must_use]
+    pub fn body_graph(&self) -> &BodyGraph {
+        &self.body_graph
+    }
+
+    /// Returns an input view of the last update, sRGB with the person's mask as alpha, in the order of [`crate::Session::viewed`].
+    #[must_use]
+    pub fn input(&self, view: usize) -> &[u8] {
+        self.inputs.images().get(view).map_or(&[], |input| &input.rgba)
+    }
+
+    /// Reads back what the last update observed. Needs [`Self::keep_observations`].
+    pub(crate) fn observed(&self, gpu: &GpuContext) -> Result<Observed, FusionError> {
         let picture = |&i: &usize| {
-            let InputImage { size: [width, height], rgba, .. } = &self.inputs[i];
-            ViewImage { width: *width, height: *height, rgba }
+            let InputImage { size: [width, height], rgba, .. } = &self.inputs.images()[i];
+            (*width, *height, rgba.clone())
         };
-        let pictures: Vec<_> = self.painted.iter().map(picture).collect();
-        let learned = match networks {
-            Networks::Processor(learned) => learned,
-            Networks::Adapter(learned) => {
-                learned.paint(gpu, &self.appearance, &self.gaussians, &pictures, &self.settings)?;
-                gpu.wait()?;
-                stages.add("networks", start.elapsed());
-                return Ok(());
-            }
-        };
-        let observed = self.appearance.observations(gpu, self.painted.len())?;
-        let before = learned.counts;
-        let colors = learned.paint(&observed, &pictures, &self.settings)?;
-        self.gaussians.color.write(gpu, &colors);
-        stages.add("networks", start.elapsed());
-        let counts = learned.counts;
-        stages.count("views not encoded", counts.views_kept - before.views_kept);
-        stages.count("Gaussian corrections used again", counts.colors_kept - before.colors_kept);
-        stages.count("corrections that were no numbers", counts.poisoned - before.poisoned);
-        Ok(())
+        let (painted, gaussians) = (self.painter.painted(), self.geometry.gaussians());
+        Ok(Observed {
+            observations: self.painter.observations(gpu)?,
+            slots: painted.iter().filter_map(|&i| self.track.viewed.get(i).copied()).collect(),
+            pictures: painted.iter().map(picture).collect(),
+            center_scale: gaussians.center_scale.read(gpu)?,
+            normal: gaussians.normal.read(gpu)?,
+        })
     }
 
-    /// Forgets clothes and colours: another person may come. Returns to those known before the first image, where there are any.
-    pub(crate) fn forget(&mut self, gpu: &GpuContext) -> Result<(), FusionError> {
-        self.updates = 0;
-        if let Some(deformation) = &mut self.deformation {
-            deformation.reset();
-        }
-        self.appearance.reset();
-        match &mut self.networks {
-            Some(Networks::Processor(learned)) => learned.reset(),
-            Some(Networks::Adapter(learned)) => learned.reset(),
-            None => {}
-        }
-        match self.start.clone() {
-            Some(start) => self.show(gpu, &start),
-            None => Ok(()),
-        }
+    /// Returns whether the person was met within the last updates and gets all the work at whatever level of effort.
+    pub(crate) fn is_new(&self) -> bool {
+        self.schedule.is_new()
     }
 
-    /// Reads back what was learnt about the person.
-    pub(crate) fn memory(&self, gpu: &GpuContext) -> Result<PersonMemory, FusionError> {
-        let translations = self.deformation.as_ref().map_or_else(Vec::new, |known| known.translations().to_vec());
-        let colors = self.direct_colors.as_ref().unwrap_or(&self.gaussians.color);
-        let networks = match &self.networks {
-            Some(Networks::Processor(learned)) if !learned.memory().weights().is_empty() => {
-                Some(NetworkMemory { digest: learned.digest(), memory: learned.memory().clone() })
-            }
-            // Those on the adapter begin anew.
-            _ => None,
-        };
-        let (memory, colors) = (self.appearance.memory(gpu)?, colors.read(gpu)?);
-        let bare = (&self.template, Outfit::default());
-        let (shape, outfit) = self.undressed.as_ref().map_or(bare, |(shape, outfit)| (shape, *outfit));
-        Ok(PersonMemory::new((shape, outfit), translations, memory, colors, networks))
+    /// Prepares for an update with images of other cameras than the last.
+    pub(crate) fn views_changed(&mut self) {
+        self.geometry.views_changed();
     }
 
-    /// Resumes from what an earlier session has learnt about the same person.
-    pub(crate) fn restore(&mut self, gpu: &GpuContext, memory: &PersonMemory) -> Result<(), FusionError> {
-        let count = self.gaussians.count();
-        if memory.colors.len() != count {
-            return Err(FusionError::SavedPerson {
-                name: self.id.to_string(),
-                problem: format!(
-                    "it has {} Gaussians, the session {count}; set body.gaussians to {0}, or delete it",
-                    memory.colors.len()
-                ),
-            });
-        }
-        self.show(gpu, memory)?;
-        if memory.is_start {
-            self.start_from(Arc::new(memory.clone()));
-        }
-        if let (Some(Networks::Processor(learned)), Some(of)) = (&mut self.networks, &memory.networks)
-            && learned.digest() == of.digest
-        {
-            learned.restore(of.memory.clone());
-        }
-        self.watch.resume();
-        Ok(())
+    /// Suspends the deformation, or lets it go on.
+    pub(crate) fn hold_shape(&mut self, hold: bool) {
+        self.geometry.hold(hold);
     }
 
-    /// Keeps what is known before the first image.
-    fn start_from(&mut self, start: Arc<PersonMemory>) {
-        if let Some(avatar) = &start.stream {
-            if avatar.template.joints().len() == self.template.skeleton.joints().len() {
-                self.stream_template = Arc::clone(avatar);
-            } else {
-                tracing::warn!("person {} has other joints than the avatar: viewers get surface and colours", self.id);
-            }
-        }
-        self.start = Some(start);
-    }
-
-    /// Takes deformation and colours from a memory of as many Gaussians.
-    fn show(&mut self, gpu: &GpuContext, memory: &PersonMemory) -> Result<(), FusionError> {
-        if let Some(deformation) = &mut self.deformation {
-            // A memory without deformation is of a body at rest.
-            let rest = vec![glam::DVec3::ZERO; deformation.translations().len()];
-            let known = if memory.translations.is_empty() { &rest } else { &memory.translations };
-            deformation.resume(gpu, known)?;
-        }
-        self.appearance.resume(gpu, &memory.memory)?;
-        self.gaussians.color.write(gpu, &memory.colors);
-        if let Some(direct) = &self.direct_colors {
-            direct.write(gpu, &memory.colors);
-        }
-        Ok(())
-    }
-
-    /// Takes over what belongs to no device: poses, tracking quality, and the memory of networks on the processor. For the same person on another device.
-    pub(crate) fn take_over(&mut self, old: &Self) {
-        let resumed = self.watch.is_resumed();
-        self.curve.clone_from(&old.curve);
-        self.last_pose.clone_from(&old.last_pose);
-        self.viewed.clone_from(&old.viewed);
-        if let Some(start) = &old.start {
-            self.start_from(Arc::clone(start));
-        }
-        (self.confidence, self.shape_held, self.shape) = (old.confidence, old.shape_held, old.shape);
-        if resumed {
-            self.watch.clone_from(&old.watch);
-            // Those on the adapter went with the device.
-            if let (Some(Networks::Processor(networks)), Some(Networks::Processor(old))) =
-                (&mut self.networks, &old.networks)
-            {
-                networks.restore(old.memory().clone());
-            }
-        }
-    }
-
-    /// The next frames get the iterations of a start.
+    /// Gives the next frame sets the iterations of a start.
     pub(crate) fn restart(&mut self) {
-        if let Some(deformation) = &mut self.deformation {
-            deformation.restart();
-        }
+        self.geometry.restart();
     }
 
-    /// By view of the last update: how much of the person is where the image shows it, 0 to 1. Empty when the body was not
-    /// compared with the images, None for a view that was not.
+    /// Returns the fraction of the person that each view of the last update confirms, 0..=1. Empty when the body was not compared
+    /// with the images, `None` for a view that was not compared.
     pub(crate) fn agreement(&self) -> Vec<Option<f64>> {
-        self.judged.iter().map(|judged| judged.map(|(quality, _)| quality)).collect()
+        self.geometry.agreement().iter().map(|view| view.map(|view| view.fraction)).collect()
     }
 
-    /// How many Gaussians are compared with the images; 0 where the body is only skinned.
+    /// Returns the number of Gaussians that are compared with the images; 0 where the body is only skinned.
     pub fn compared_gaussians(&self) -> usize {
-        self.deformation.as_ref().map_or(0, Deformation::compared)
+        self.geometry.compared_gaussians()
     }
 
-    /// Report of the deformation's last solve.
+    /// Returns the report of the deformation's last solve.
     pub fn deform_report(&self) -> Option<&DeformReport> {
-        self.deformation.as_ref().and_then(Deformation::report)
+        self.geometry.report()
     }
 
-    /// The Gaussians of this instant.
+    /// Reads back the Gaussians at the last update's time.
     pub(crate) fn splats(&self, gpu: &GpuContext) -> Result<Vec<Splat>, FusionError> {
-        Ok(read_splats(gpu, &self.gaussians)?)
+        Ok(read_splats(gpu, self.geometry.gaussians())?)
     }
 
-    /// The tracked surface: world positions and normals of the template's vertices.
-    pub fn surface(&self, pose: &Pose) -> (Vec<glam::Vec3>, Vec<glam::Vec3>) {
-        let Some(deformation) = &self.deformation else { return skin_mesh(&self.template, pose) };
-        let mut moved = self.template.clone();
-        for (position, by) in moved.positions.iter_mut().zip(deformation.vertex_displacement()) {
-            *position += by;
-        }
-        skin_mesh(&moved, pose)
+    /// Returns the tracked surface: world positions, metres, and normals of the template's vertices.
+    pub fn surface(&self, pose: &Pose) -> (Vec<Vec3>, Vec<Vec3>) {
+        self.geometry.surface(&self.shape.template, pose)
     }
-
-    /// Converts the images to RGB with the mask as alpha and without the background along its outline, and uploads each once.
-    fn take_images(&mut self, gpu: &GpuContext, views: &[InputView<'_>]) -> Result<(), FusionError> {
-        for (i, view) in views.iter().enumerate() {
-            let (image, mask) = (view.image, view.mask);
-            let size = [image.width(), image.height()];
-            for mask in std::iter::once(mask).chain(view.others) {
-                if [mask.width(), mask.height()] != size {
-                    return Err(FusionError::MaskSize {
-                        camera: view.camera.id.clone(),
-                        mask: (mask.width(), mask.height()),
-                        image: (image.width(), image.height()),
-                    });
-                }
-            }
-            if self.inputs.get(i).is_none_or(|input| input.size != size) {
-                let words = StorageBuffer::zeroed(
-                    gpu,
-                    &format!("the image of camera {}", view.camera.id),
-                    size[0] as usize * size[1] as usize,
-                )?;
-                let input = InputImage { size, rgba: Vec::new(), words, matcher: None };
-                if i < self.inputs.len() {
-                    self.inputs[i] = input;
-                } else {
-                    self.inputs.push(input);
-                }
-            }
-            let converted;
-            let rgb = if image.format() == flyrig_types::PixelFormat::Rgb8 {
-                image.bytes()
-            } else {
-                converted = to_rgb8(image)?;
-                &converted
-            };
-            let InputImage { rgba, words, matcher, .. } = &mut self.inputs[i];
-            rgba.clear();
-            rgba.extend(rgb.chunks_exact(3).zip(mask.coverage()).flat_map(|(c, &a)| [c[0], c[1], c[2], a]));
-            for EdgeColor { pixel, rgb } in view.edge_colors {
-                if let Some(pixel) = rgba.get_mut(4 * *pixel as usize..).and_then(<[u8]>::first_chunk_mut::<3>) {
-                    *pixel = *rgb;
-                }
-            }
-            if matcher.as_ref().is_none_or(|matcher| !matcher.is_of(view.camera)) {
-                *matcher = ColorMatcher::new(view.camera);
-            }
-            if let Some(matcher) = matcher {
-                matcher.correct(rgba, 4, size[0] as usize, |pixel| pixel[3] == 0);
-            }
-            if let Some(others) = view.others {
-                for (pixel, others) in rgba.chunks_exact_mut(4).zip(others.coverage()) {
-                    if *others >= OTHERS_COVER {
-                        pixel.copy_from_slice(&UNKNOWN_RGBA);
-                    }
-                }
-            }
-            words.write_bytes(gpu, rgba);
-        }
-        Ok(())
-    }
-}
-
-/// Width on the person of a pixel of the finest camera, at the point that all cameras look at, metres.
-fn finest_pixel_m(rig: &Rig) -> f64 {
-    let center = rig.center_of_attention();
-    let pixel = |camera: &Camera| camera.position().distance(center) / (0.5 * camera.intrinsics.focal_px.element_sum());
-    rig.cameras.iter().map(pixel).fold(f64::INFINITY, f64::min)
 }

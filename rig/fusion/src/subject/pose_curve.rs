@@ -1,13 +1,13 @@
-//! Poses between and shortly after the instants that a pose was estimated at.
+//! Poses between and shortly after the times at which poses were estimated.
 
 use flyrig_types::Pose;
 
-/// Beyond this share of the distance between the last two poses the motion is no longer taken to go on as it did.
+/// Farthest extrapolation beyond the last pose, as a share of the time between the last two.
 const FARTHEST: f64 = 1.0;
-/// Poses farther apart say nothing about what lies between them.
+/// Longest time between two poses that are interpolated, nanoseconds.
 const MAX_GAP_NANOS: u64 = 150_000_000;
 
-/// The last two poses.
+/// Last two poses with their times, nanoseconds.
 #[derive(Debug, Clone, Default)]
 pub struct PoseCurve {
     before: Option<(i64, Pose)>,
@@ -15,14 +15,14 @@ pub struct PoseCurve {
 }
 
 impl PoseCurve {
-    /// The pose at a later time than all before; one that is not later starts the curve anew.
+    /// Adds the pose at a later time than all before. A time that is not later starts the curve anew.
     pub fn push(&mut self, nanos: i64, pose: &Pose) {
         self.before = self.last.take().filter(|(t, _)| *t < nanos && t.abs_diff(nanos) <= MAX_GAP_NANOS);
         self.last = Some((nanos, pose.clone()));
     }
 
-    /// Pose at a time near the last one: between the last two, or on beyond them. None without two poses near each
-    /// other.
+    /// Returns the pose at a time near the last one, interpolated between the last two or extrapolated beyond them. `None` without two
+    /// poses near each other.
     pub fn at(&self, nanos: i64) -> Option<Pose> {
         let ((t0, before), (t1, last)) = self.before.as_ref().zip(self.last.as_ref())?;
         let since = |t: i64| (i128::from(t) - i128::from(*t0)) as f64;
@@ -30,7 +30,7 @@ impl PoseCurve {
         if share <= 1.0 {
             return Some(before.interpolate(last, share.max(0.0)));
         }
-        // What turned from `before` to `last` turns on.
+        // Rotations from `before` to `last` go on.
         let beyond = (share - 1.0).min(FARTHEST);
         let step = last.root_translation - before.root_translation;
         let turn = |(a, b): (&glam::DQuat, &glam::DQuat)| {

@@ -1,4 +1,6 @@
-//! How well the person is followed, and what to do when not: degrade, and come back by itself.
+//! Tracking quality of one person, and the remedies for bad tracking: the state degrades and recovers by itself.
+//!
+//! Views that cannot be right are left out before they are assessed here; state and quality are published.
 
 use std::collections::BTreeMap;
 
@@ -6,36 +8,38 @@ use flyrig_tracker::FIRST_FRAMES;
 use flyrig_types::{CameraId, Pose};
 use serde::Serialize;
 
-/// A frame below this quality is bad; so many in a row, and the deformation starts anew.
+/// Quality below which a frame set is bad.
 const BAD_QUALITY: f64 = 0.4;
+/// Number of bad frame sets in a row after which the deformation starts anew.
 const BAD_FRAMES: u32 = 5;
-/// Above this the person counts as followed again.
+/// Least quality at which the person counts as followed again.
 const GOOD_QUALITY: f64 = 0.6;
-/// Away for longer, the person may be another one when somebody returns.
+/// Absence after which a person who appears may be another one, nanoseconds.
 const LOST_AFTER_NANOS: u64 = 1_000_000_000;
-/// Nobody moves faster, metres a second, or farther in one step before it is called a leap, metres.
+/// Largest speed of a person, metres per second; a faster one is a leap.
 const FASTEST_M_A_SEC: f64 = 12.0;
+/// Least distance of a leap, metres.
 const LEAST_LEAP_M: f64 = 0.3;
 
-/// Where the tracking stands.
+/// State of the tracking of one person.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize)]
 #[serde(rename_all = "lowercase")]
 pub enum TrackState {
-    /// Nobody was seen yet.
+    /// Not seen yet.
     #[default]
     Searching,
-    /// The first frames of a person.
+    /// In the first frame sets of a person.
     First,
-    /// Following.
+    /// Followed.
     Steady,
-    /// After a leap, a short loss or bad frames.
+    /// After a leap, a short loss or bad frame sets.
     Recovering,
-    /// Nobody there now.
+    /// Not seen now.
     Lost,
 }
 
 impl TrackState {
-    /// For statistics.
+    /// Returns the name of the state in statistics.
     pub fn name(self) -> &'static str {
         match self {
             Self::Searching => "searching",
@@ -47,24 +51,28 @@ impl TrackState {
     }
 }
 
-/// What must happen before the next frame is taken in.
+/// Action that must happen before the next update.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Remedy {
     /// Nothing.
     None,
-    /// What is known of the clothes stays, but the next frames get the iterations of a start.
+    /// The deformation is kept, but the next frame sets get the iterations of a start.
     Restart,
     /// Clothes and colours are forgotten.
     Forget,
 }
 
-/// Follows the state over the frames.
+/// Tracking state and quality of one person over the frame sets.
 #[derive(Debug, Clone, Default)]
 pub struct TrackWatch {
     state: TrackState,
+    /// Frame sets since the last start or restart.
     since: u32,
+    /// Bad frame sets in a row.
     bad: u32,
+    /// Last pose and its time, nanoseconds.
     last: Option<(i64, Pose)>,
+    /// Time since which the person is away, nanoseconds.
     away_since: Option<i64>,
     /// Whether the person is known from an earlier session.
     resumed: bool,
@@ -73,34 +81,35 @@ pub struct TrackWatch {
 }
 
 impl TrackWatch {
-    /// Where the tracking stands.
+    /// Returns the tracking state.
     pub fn state(&self) -> TrackState {
         self.state
     }
 
-    /// Of the last frame: how much of the person is where the images show it, 0 to 1. None when nothing was compared.
+    /// Returns the fraction of the person that the images of the last frame set confirm, 0..=1: the median over the cameras. `None` when
+    /// nothing was compared.
     pub fn quality(&self) -> Option<f64> {
         self.quality
     }
 
-    /// The same a camera; one that is covered, or sees something else, is near 0.
+    /// Returns that fraction for each camera; it is near 0 for one that is covered or sees something else.
     pub fn cameras(&self) -> &BTreeMap<CameraId, f64> {
         &self.cameras
     }
 
-    /// The person is known from an earlier session: the first one to arrive keeps clothes and colours.
+    /// Lets the first person to arrive keep clothes and colours, which are known from an earlier session.
     pub fn resume(&mut self) {
         self.resumed = true;
     }
 
-    /// Whether a person of an earlier session is still awaited.
+    /// Returns whether a person of an earlier session is still awaited.
     #[must_use]
     pub fn is_resumed(&self) -> bool {
         self.resumed
     }
 
-    /// Nobody was there.
-    pub fn away(&mut self, nanos: i64) {
+    /// Notes that the person was not seen in a frame set.
+    pub fn leave(&mut self, nanos: i64) {
         self.away_since.get_or_insert(nanos);
         (self.quality, self.bad) = (None, 0);
         self.cameras.clear();
@@ -109,7 +118,7 @@ impl TrackWatch {
         }
     }
 
-    /// Somebody is there, in this pose.
+    /// Notes that the person was seen in this pose, and returns the remedy that must come first.
     pub fn arrive(&mut self, nanos: i64, pose: &Pose) -> Remedy {
         let away = self.away_since.take();
         let last = self.last.replace((nanos, pose.clone()));
@@ -136,11 +145,11 @@ impl TrackWatch {
         remedy
     }
 
-    /// What came of the frame: a quality a camera.
-    pub fn judge(&mut self, cameras: impl IntoIterator<Item = (CameraId, f64)>) {
+    /// Assesses an update by the agreement of each camera, 0..=1.
+    pub fn assess(&mut self, cameras: impl IntoIterator<Item = (CameraId, f64)>) {
         self.cameras =
             cameras.into_iter().map(|(id, q)| (id, if q.is_finite() { q.clamp(0.0, 1.0) } else { 0.0 })).collect();
-        // The median: one covered camera says nothing about the person.
+        // The median, since one covered camera is not informative for the person.
         let mut sorted: Vec<f64> = self.cameras.values().copied().collect();
         sorted.sort_by(f64::total_cmp);
         self.quality = sorted.get(sorted.len() / 2).copied();
@@ -167,12 +176,12 @@ mod tests {
         Pose { root_translation: DVec3::new(x, 0.0, 1.0), joint_rotations: vec![DQuat::IDENTITY] }
     }
 
-    /// Follows for `frames` with one quality for all of three cameras.
+    /// Follows the person for `frames` frame sets with these qualities of three cameras.
     fn follow(watch: &mut TrackWatch, from: i64, frames: i64, x: f64, quality: [f64; 3]) -> Vec<Remedy> {
         (from..from + frames)
             .map(|i| {
                 let remedy = watch.arrive(i * FRAME, &pose(x));
-                watch.judge((0..3).map(|c| (format!("0{c}").as_str().into(), quality[c])));
+                watch.assess((0..3).map(|c| (format!("0{c}").as_str().into(), quality[c])));
                 remedy
             })
             .collect()
@@ -181,20 +190,20 @@ mod tests {
     #[test]
     fn first_frames_steady_short_loss_and_long_loss() {
         let mut watch = TrackWatch::default();
-        watch.away(0);
+        watch.leave(0);
         assert_eq!((watch.state(), watch.quality()), (TrackState::Searching, None));
         let remedies = follow(&mut watch, 1, 10, 0.0, [0.9; 3]);
         assert_eq!(remedies[0], Remedy::Forget);
         assert!(remedies[1..].iter().all(|r| *r == Remedy::None));
         assert_eq!((watch.state(), watch.quality()), (TrackState::Steady, Some(0.9)));
         for i in 11..20 {
-            watch.away(i * FRAME);
+            watch.leave(i * FRAME);
         }
         assert_eq!((watch.state(), watch.quality()), (TrackState::Lost, None));
         assert_eq!(follow(&mut watch, 20, 12, 0.0, [0.9; 3])[0], Remedy::Restart, "still the same person");
         assert_eq!(watch.state(), TrackState::Steady);
         for i in 40..80 {
-            watch.away(i * FRAME);
+            watch.leave(i * FRAME);
         }
         assert_eq!(follow(&mut watch, 80, 12, 0.0, [0.9; 3])[0], Remedy::Forget, "perhaps another");
         assert_eq!(watch.state(), TrackState::Steady);

@@ -10,7 +10,7 @@ use glam::{DMat3, DMat4, DVec3};
 use super::super::DeformOptions;
 use super::reference::{self, Picture, Splat, blend, sorted_splats_at};
 use super::reference_backward::{Incoming, backward, lift, touched_by};
-use super::small_scene::{Shot, SmallScene};
+use super::small_scene::{SceneShot, SmallScene};
 
 /// A person 400 pixels high.
 const PAPER_PIXELS_A_M2: f64 = (400.0 / 1.75) * (400.0 / 1.75);
@@ -82,7 +82,7 @@ impl<'a> Chain<'a> {
         self.scene.posed(&self.rest, bones, |g| self.displacement(&self.translations, g)).1
     }
 
-    fn views(&self, shot: &Shot) -> Vec<View> {
+    fn views(&self, shot: &SceneShot) -> Vec<View> {
         let SmallScene { template, surface, graph, cameras, .. } = self.scene;
         let spacing = (template.area_m2() / surface.len() as f64).sqrt();
         let view = |((camera, pose), rgba): ((&Camera, _), &Vec<u8>)| {
@@ -210,7 +210,7 @@ impl<'a> Chain<'a> {
     }
 
     /// Takes in one frame; the losses before the first and after each accepted step.
-    pub fn track(&mut self, shot: &Shot) -> Vec<f64> {
+    pub fn track(&mut self, shot: &SceneShot) -> Vec<f64> {
         let views = self.views(shot);
         let total = |chain: &Self, t: &[DVec3]| chain.data_loss(&views, t) + chain.prior(t).0;
         if let Some(floor) = self.floor.filter(|_| self.frame >= 10) {

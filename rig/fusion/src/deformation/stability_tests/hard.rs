@@ -4,13 +4,13 @@ use flyrig_body::{DEFAULT_SIGMA2_M2, build_graph};
 use flyrig_types::Isometry;
 use glam::{DVec2, DVec3, Vec3};
 
-use super::small_scene::{Device, Shot, SmallScene};
+use super::small_scene::{SceneShot, SmallScene, TestedDeformation};
 use super::{gpu, options};
 
 struct Hard {
     name: &'static str,
     scene: fn(&mut SmallScene),
-    shot: fn(&mut Shot),
+    shot: fn(&mut SceneShot),
     /// Whether there is something to follow.
     moves: Option<bool>,
 }
@@ -59,12 +59,12 @@ fn hide(scene: &mut SmallScene) {
     }
 }
 
-fn masks(shot: &mut Shot, value: u8) {
+fn masks(shot: &mut SceneShot, value: u8) {
     shot.rgba.iter_mut().for_each(|rgba| rgba.iter_mut().skip(3).step_by(4).for_each(|a| *a = value));
 }
 
 const MIDDLE: DVec3 = DVec3::new(0.0, 0.9, 0.0);
-const AS_SEEN: fn(&mut Shot) = |_| ();
+const AS_SEEN: fn(&mut SceneShot) = |_| ();
 
 const CASES: [Hard; 22] = [
     Hard { name: "nothing", scene: |_| (), shot: AS_SEEN, moves: Some(true) },
@@ -129,7 +129,7 @@ fn hard_scenes_give_finite_steps_that_never_raise_the_loss() {
         let mut scene = SmallScene::new(80, 10, 48);
         spoil(&mut scene);
         seen.cameras.clone_from(&scene.cameras);
-        let mut device = Device::new(gpu(), &scene, options());
+        let mut device = TestedDeformation::new(gpu(), &scene, options());
         let (mut steps, mut losses) = (0, Vec::new());
         for frame in 0..3 {
             let mut shot = seen.shot(f64::from(frame));

@@ -10,7 +10,10 @@ use flyrig_tracker::DeformReport;
 use flyrig_types::{Camera, Intrinsics, Isometry, Lens, Pose};
 use glam::{DMat4, DQuat, DVec2, DVec3, Vec3};
 
-use super::super::{DeformOptions, Deformation, Instants, TrackedView};
+use super::super::{
+    DeformOptions, Deformation,
+    scene::{TrackedPerson, TrackedView},
+};
 use super::reference::{self, blend, sorted_splats_at};
 
 pub struct SmallScene {
@@ -23,7 +26,7 @@ pub struct SmallScene {
 }
 
 /// Images of one frame, each with its own pose.
-pub struct Shot {
+pub struct SceneShot {
     pub poses: Vec<Pose>,
     /// sRGB bytes with coverage.
     pub rgba: Vec<Vec<u8>>,
@@ -81,9 +84,9 @@ impl SmallScene {
     }
 
     /// What the cameras see: each exposes a quarter of a frame after the one before it.
-    pub fn shot(&self, frame: f64) -> Shot {
+    pub fn shot(&self, frame: f64) -> SceneShot {
         let rest = self.surface.inset();
-        let mut shot = Shot { poses: Vec::new(), rgba: Vec::new() };
+        let mut shot = SceneShot { poses: Vec::new(), rgba: Vec::new() };
         for (k, camera) in self.cameras.iter().enumerate() {
             let pose = self.pose(frame + 0.25 * k as f64);
             let bones = self.template.skeleton.world_from_canonical(&pose);
@@ -103,7 +106,7 @@ impl SmallScene {
     }
 
     /// A shot as the deformation takes it.
-    pub fn views<'a>(&'a self, shot: &'a Shot, images: &'a [StorageBuffer<u32>]) -> Vec<TrackedView<'a>> {
+    pub fn views<'a>(&'a self, shot: &'a SceneShot, images: &'a [StorageBuffer<u32>]) -> Vec<TrackedView<'a>> {
         let cameras = self.cameras.iter().zip(&shot.rgba).zip(images).enumerate();
         let view = |(instant, ((camera, rgba), words)): (usize, ((&'a Camera, &'a Vec<u8>), _))| TrackedView {
             camera,
@@ -137,14 +140,14 @@ fn camera(azimuth: f64, side: u32) -> Camera {
 }
 
 /// The deformation as the engine runs it.
-pub struct Device {
+pub struct TestedDeformation {
     gpu: GpuContext,
     pub deformation: Deformation,
     gaussians: GaussianBuffers,
     skinner: GpuSkinner,
 }
 
-impl Device {
+impl TestedDeformation {
     pub fn new(gpu: &GpuContext, scene: &SmallScene, options: DeformOptions) -> Self {
         let gaussians = GaussianBuffers::zeroed(gpu, scene.surface.len()).unwrap();
         gaussians.color.write(gpu, &scene.colors);
@@ -157,9 +160,9 @@ impl Device {
     }
 
     /// None when there is nothing to compare with.
-    pub fn track(&mut self, scene: &SmallScene, shot: &Shot) -> Option<DeformReport> {
+    pub fn track(&mut self, scene: &SmallScene, shot: &SceneShot) -> Option<DeformReport> {
         let instants: Vec<&Pose> = shot.poses.iter().collect();
-        let lent = Instants {
+        let lent = TrackedPerson {
             gpu: &self.gpu,
             skeleton: &scene.template.skeleton,
             poses: &instants,

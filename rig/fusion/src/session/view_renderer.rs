@@ -1,49 +1,49 @@
-//! Draws all people of a session into one view.
+//! Rendering of all people of a session into one view.
 
 use flyrig_gpu::{GpuContext, StageTimer};
 use flyrig_renderer::{GaussianBuffers, Outputs, RasterSettings, Rasterizer, RenderTarget, ViewBytes};
 use flyrig_types::{Camera, RenderedView};
 
-use crate::{FusionError, StageTimes};
+use crate::{error::FusionError, health::stage_times::StageTimes};
 
 /// Name of the stage.
 const STAGE: &str = "render a view";
-/// Targets kept for views of different sizes.
+/// Largest number of targets that are kept for views of different sizes.
 const TARGETS: usize = 4;
 
-/// The rasteriser and its targets, shared by all people and views.
+/// Rasteriser and its targets, shared by all people and views.
 #[derive(Debug)]
-pub(crate) struct Drawing {
+pub(crate) struct ViewRenderer {
     pub rasterizer: Rasterizer,
-    /// Most recently used last.
+    /// Targets, the most recently used last.
     targets: Vec<RenderTarget>,
     /// Gaussians of several people, one after the other.
     joined: Option<GaussianBuffers>,
     /// Whether `joined` holds the people as they are now.
     is_current: bool,
-    /// Of [`STAGE`].
+    /// Timer of [`STAGE`].
     timer: StageTimer,
     bytes: ViewBytes,
 }
 
-impl Drawing {
+impl ViewRenderer {
     pub fn new(gpu: &GpuContext, max_gaussians: usize) -> Result<Self, FusionError> {
         let rasterizer = Rasterizer::new(gpu, max_gaussians)?;
         let (timer, bytes) = (StageTimer::new(gpu, 1), ViewBytes::new(gpu)?);
         Ok(Self { rasterizer, targets: Vec::new(), joined: None, is_current: false, timer, bytes })
     }
 
-    /// Somebody has moved or changed colour.
+    /// Notes that a person has moved or changed colour.
     pub fn people_changed(&mut self) {
         self.is_current = false;
     }
 
-    /// Whether views are timed without waiting for what was submitted before.
+    /// Returns whether views are timed without waiting for earlier submissions.
     pub fn is_timed_by_adapter(&self) -> bool {
         self.timer.is_supported()
     }
 
-    /// Draws these people as `camera` sees them. People hide each other.
+    /// Renders these people as `camera` sees them. People hide each other.
     pub fn render(
         &mut self,
         gpu: &GpuContext,
@@ -53,15 +53,7 @@ impl Drawing {
     ) -> Result<RenderedView, FusionError> {
         let (width, height) = (camera.intrinsics.width, camera.intrinsics.height);
         let start = std::time::Instant::now();
-        let target = match self.targets.iter().position(|target| (target.width, target.height) == (width, height)) {
-            Some(known) => self.targets.remove(known),
-            None => {
-                if self.targets.len() >= TARGETS {
-                    self.targets.remove(0);
-                }
-                RenderTarget::of_color(gpu, width, height)?
-            }
-        };
+        let target = self.target(gpu, (width, height))?;
         let mut encoder = gpu.device.create_command_encoder(&Default::default());
         self.timer.begin(&mut encoder);
         let gaussians = match people {
@@ -81,7 +73,7 @@ impl Drawing {
             gpu.wait()?;
             stages.add(STAGE, start.elapsed());
         }
-        // Where the adapter measures its own time, reading back is also what waits for it.
+        // Where the adapter measures its own time, only reading back waits for it.
         let rgba = stages.time("read a view back", || self.bytes.read(gpu, &target))?;
         for stage in self.timer.collect() {
             stages.add_of_adapter(stage.name, stage.time);
@@ -89,9 +81,20 @@ impl Drawing {
         self.targets.push(target);
         Ok(RenderedView { width, height, rgba })
     }
+
+    /// Takes the target of this size out of those that are kept, or creates one.
+    fn target(&mut self, gpu: &GpuContext, size: (u32, u32)) -> Result<RenderTarget, FusionError> {
+        if let Some(known) = self.targets.iter().position(|target| (target.width, target.height) == size) {
+            return Ok(self.targets.remove(known));
+        }
+        if self.targets.len() >= TARGETS {
+            self.targets.remove(0);
+        }
+        Ok(RenderTarget::of_color(gpu, size.0, size.1)?)
+    }
 }
 
-/// Returns the people's Gaussians in one set of buffers; those of `joined` are kept if they are current.
+/// Copies the people's Gaussians into one set of buffers, unless `joined` holds them already.
 fn join<'a>(
     gpu: &GpuContext,
     encoder: &mut wgpu::CommandEncoder,
