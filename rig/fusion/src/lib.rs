@@ -49,11 +49,8 @@ pub use settings::{
     SessionSettings, Solver, TrackingSettings,
 };
 pub use subject::{
-    Observed, PROCESSOR_STAGE, Subject,
-    memory::PersonMemory,
-    person_gaussians, person_surface,
-    stream_frame::{PersonFrame, stream_joints},
-    track_watch::{Remedy, TrackState, TrackWatch},
+    Observed, PROCESSOR_STAGE, PersonFrame, PersonMemory, Remedy, Subject, TrackState, TrackWatch, person_gaussians,
+    person_surface, stream_joints,
 };
 
 pub use flyrig_renderer::Splat;
@@ -62,7 +59,7 @@ pub use glam;
 
 /// Template bodies: the built-in one, and skinned glTF files.
 pub mod body {
-    pub use flyrig_body::{BodyError, Outfit, ShapeParams, Template, default_template, load_template};
+    pub use flyrig_body::{BodyError, Outfit, ShapeParams, Template, default_template, load_gltf};
 }
 
 /// Calibrations of the input cameras.

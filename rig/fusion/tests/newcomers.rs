@@ -65,7 +65,7 @@ fn a_person_who_arrives_is_prepared_beside_the_sets_and_is_the_same_as_otherwise
     let mut waiting = session(3000, 3, u64::MAX);
     assert_eq!(until_updated(&mut waiting, &set).0, 2, "nobody is known in two sets");
     let mut beside = session(3000, 3, u64::MAX);
-    beside.work_beside();
+    beside.use_threads();
     let (held, why) = until_updated(&mut beside, &set);
     assert!(held > 2, "the set in which the person is new does not wait");
     assert_eq!(why, "person 0 is being prepared");
@@ -76,7 +76,7 @@ fn a_person_who_arrives_is_prepared_beside_the_sets_and_is_the_same_as_otherwise
 fn a_person_of_another_shape_is_shown_as_before_until_the_new_one_is_ready() {
     let set = frame_set(0, &images(&[(0.0, [220, 40, 30])]));
     let mut session = session(3000, 0, 3);
-    session.work_beside();
+    session.use_threads();
     let height = |session: &Session| {
         let positions = &session.subject(PERSON).unwrap().template().positions;
         positions.iter().map(|position| position.y).fold(0.0f32, f32::max)

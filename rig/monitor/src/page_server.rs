@@ -1,4 +1,4 @@
-//! The HTTP server of one page: the metrics, or the progress of a calibration.
+//! HTTP server of one page: the metrics, or the progress of a calibration.
 
 use std::{
     convert::Infallible,
@@ -24,22 +24,22 @@ use tokio::{
     time::{sleep, timeout},
 };
 
-/// Time that a client has to ask.
+/// Time within which a client must send its request.
 const PATIENCE: Duration = Duration::from_secs(1);
 /// Time from the connection to the end of the answer.
 const LONGEST: Duration = Duration::from_secs(2);
-/// Longest request that is read, the smallest bound that hyper takes.
+/// Largest request that is read, bytes: the smallest bound that hyper accepts.
 const REQUEST_BYTES: usize = 8192;
-/// Clients that are served at the same time; the others wait in the system's queue.
+/// Largest number of clients that are served at the same time; others wait in the system's queue.
 const CONNECTIONS: usize = 32;
-/// Pause after a connection could not be accepted: with no file descriptor left, trying at once only costs time.
+/// Pause after a connection could not be accepted: without a free file descriptor, trying at once only costs time.
 const PAUSE: Duration = Duration::from_millis(100);
 
-/// Answers HTTP requests with the text published last, in one thread.
+/// Server that answers HTTP requests with the text published last, in one thread.
 pub struct PageServer {
     text: Arc<Mutex<String>>,
     address: SocketAddr,
-    /// Dropping it ends the thread.
+    /// Sender whose drop ends the thread.
     stop: Option<oneshot::Sender<()>>,
     thread: Option<JoinHandle<()>>,
 }
@@ -72,7 +72,7 @@ impl PageServer {
         Ok(Self { text, address, stop: Some(stop), thread: Some(thread) })
     }
 
-    /// Returns the address that is listened on.
+    /// Returns the address on which the server listens.
     pub fn address(&self) -> SocketAddr {
         self.address
     }

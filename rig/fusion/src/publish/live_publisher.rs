@@ -20,7 +20,7 @@ use flyrig_types::{FrameSet, RenderedView, SupervisedThread, ThreadHealth};
 use image::{ExtendedColorType, ImageEncoder as _, codecs::jpeg::JpegEncoder};
 
 use super::person_publisher::PersonPublisher;
-use crate::{error::FusionError, session::Session, subject::Subject};
+use crate::{error::FusionError, session::Session, subject::person::Subject};
 
 /// Capacity of the queue before compression, in views.
 const WAITING_PICTURES: usize = 8;

@@ -26,7 +26,13 @@ use crate::{
     health::stage_times::StageTimes,
     perception::observation::{Perception, PersonObservation, SeenPerson, ViewObservation},
     settings::{effort::Effort, session::SessionSettings},
-    subject::{InputView, Observed, Subject, memory::PersonMemory, stream_frame::PersonFrame, track_watch::Remedy},
+    subject::{
+        inputs::InputView,
+        memory::PersonMemory,
+        person::{Observed, Subject},
+        stream_frame::PersonFrame,
+        track_watch::Remedy,
+    },
 };
 
 pub use budget::Budget;
@@ -237,9 +243,9 @@ impl Session {
 
     /// Prepares people who arrive in threads of their own from now on, and lets perception measure them there, so that no frame set waits
     /// for them. Results then depend on the speed of the machine.
-    pub fn work_beside(&mut self) {
-        self.newcomers.work_beside();
-        self.perceiver.work_beside();
+    pub fn use_threads(&mut self) {
+        self.newcomers.use_threads();
+        self.perceiver.use_threads();
     }
 
     /// Creates subjects for people who have none yet, and for those whose shape has changed.

@@ -10,7 +10,7 @@ use flyrig_gpu::GpuContext;
 use flyrig_types::{PersonId, Rig};
 
 use super::perceiver::Newcomer;
-use crate::{error::FusionError, settings::session::SessionSettings, subject::Subject};
+use crate::{error::FusionError, settings::session::SessionSettings, subject::person::Subject};
 
 /// Name of the threads, in errors.
 const NAME: &str = "new person";
@@ -26,7 +26,7 @@ pub(crate) struct Newcomers {
 
 impl Newcomers {
     /// Prepares subjects in threads of their own from now on. Which frame set shows a new person first then depends on the machine.
-    pub fn work_beside(&mut self) {
+    pub fn use_threads(&mut self) {
         self.beside = true;
     }
 

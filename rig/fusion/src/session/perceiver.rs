@@ -67,9 +67,9 @@ impl Perceiver {
         self.perception.move_camera(slot, camera, plate)
     }
 
-    /// Calls [`Perception::work_beside`].
-    pub fn work_beside(&mut self) {
-        self.perception.work_beside();
+    /// Calls [`Perception::use_threads`].
+    pub fn use_threads(&mut self) {
+        self.perception.use_threads();
     }
 
     /// Observes all people in a frame set.

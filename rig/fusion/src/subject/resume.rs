@@ -4,7 +4,7 @@ use std::sync::Arc;
 
 use flyrig_gpu::GpuContext;
 
-use super::{Subject, memory::PersonMemory};
+use super::{memory::PersonMemory, person::Subject};
 use crate::error::FusionError;
 
 impl Subject {

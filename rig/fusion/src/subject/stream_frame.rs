@@ -6,13 +6,9 @@
 use std::sync::Arc;
 
 use flyrig_body::{DeformationGraph, Joint, Skeleton, SurfaceGaussians};
-use flyrig_gpu::GpuContext;
 use flyrig_stream::{EncodedTemplate, Motion, StreamError, StreamJoint, TemplateSource};
 use flyrig_types::Pose;
 use glam::{DVec3, Vec3};
-
-use super::Subject;
-use crate::error::FusionError;
 
 /// Converts a skeleton's joints to those of the stream.
 #[must_use]
@@ -70,36 +66,16 @@ pub struct PersonFrame {
     pub(crate) colors: Vec<[f32; 4]>,
 }
 
-impl Subject {
-    /// Reads the person's colours back for the stream; `None` before the first pose.
-    pub(crate) fn person_frame(
-        &self,
-        gpu: &GpuContext,
-        frame: u64,
-        capture_nanos: i64,
-    ) -> Result<Option<PersonFrame>, FusionError> {
-        let Some(pose) = self.pose() else { return Ok(None) };
-        let mut motion = motion(pose, self.node_translations());
-        motion.stamp.person = self.id().0;
-        (motion.stamp.frame, motion.stamp.capture_nanos) = (frame, capture_nanos);
-        let template = self.stream_template();
-        if template.template.is_avatar() {
-            return Ok(Some(avatar_frame(template, &motion)));
-        }
-        Ok(Some(PersonFrame { template, motion, colors: self.gaussians().color.read(gpu)? }))
-    }
-}
-
-/// Builds the frame of an avatar, which a pose alone drives.
-fn avatar_frame(template: Arc<EncodedTemplate>, motion: &Motion) -> PersonFrame {
-    PersonFrame { template, motion: Motion { nodes: Vec::new(), ..motion.clone() }, colors: Vec::new() }
-}
-
 impl PersonFrame {
+    /// Builds the frame of an avatar, which a pose alone drives.
+    pub(crate) fn of_pose(template: Arc<EncodedTemplate>, motion: &Motion) -> Self {
+        Self { template, motion: Motion { nodes: Vec::new(), ..motion.clone() }, colors: Vec::new() }
+    }
+
     /// Returns this pose for viewers that draw an avatar with the same joints.
     #[must_use]
     pub fn of_avatar(&self, avatar: &Arc<EncodedTemplate>) -> Self {
-        avatar_frame(Arc::clone(avatar), &self.motion)
+        Self::of_pose(Arc::clone(avatar), &self.motion)
     }
 
     /// Returns the person's template.

@@ -74,9 +74,7 @@ impl EstimatedPerception {
     ) -> Result<Self, FusionError> {
         let config = PoseConfig {
             masks: settings.masks == Origin::Estimated,
-            height_m: settings.height_m,
-            floor_m: settings.floor_m,
-            look_after_m: settings.look_after_m,
+            settings: settings.tracker.clone(),
             ..PoseConfig::default()
         };
         let rounds = config.outline_rounds;
