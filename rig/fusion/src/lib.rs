@@ -69,9 +69,12 @@ pub mod calib {
 
 /// Cameras and recordings.
 pub mod capture {
+    #[cfg(target_os = "linux")]
+    pub use flyrig_capture::V4l2Camera;
     pub use flyrig_capture::{
-        CameraSource, CaptureError, CaptureErrorKind, FolderOptions, FolderReplay, McapReplay, Pacing, SourceOpener,
-        folder_image_size,
+        CameraControls, CameraIdentity, CameraOptions, CameraSource, CaptureError, CaptureErrorKind, FolderOptions,
+        FolderReplay, FormatChoice, McapReplay, NokhwaCamera, NokhwaOptions, Pacing, SourceOpener, VideoOptions,
+        VideoReplay, folder_image_size,
     };
 }
 

@@ -1,4 +1,4 @@
-//! The example runs, and its output is what an embedding program is promised.
+//! The example runs, depends on `flyrig-fusion` alone, and its output is as promised to embedding programs.
 #![allow(clippy::unwrap_used)] // a test may fail by panicking
 
 /// Source of the example.

@@ -1,4 +1,4 @@
-//! A live rig observes the next set while it reconstructs the one before, with the results of one set after the other.
+//! A live rig observes the next frame set while it reconstructs the one before, with the results of strictly sequential processing.
 #![allow(clippy::unwrap_used)] // a test may fail by panicking
 
 mod support;
@@ -18,10 +18,10 @@ use flyrig_types::{FrameSet, PersonId};
 
 use support::{frame_set, gpu, images, people, played, rig, settings};
 
-/// Index of each observed set, and name of the thread that observed it.
+/// Index of each observed frame set, and name of the thread that observed it.
 type Log = Arc<Mutex<Vec<(u64, String)>>>;
 
-/// Known people, and a log of who asked when.
+/// Perception of known people with a log of its calls.
 struct Logged {
     inner: GivenPerception,
     log: Log,

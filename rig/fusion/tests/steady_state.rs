@@ -1,4 +1,4 @@
-//! A session that runs creates no GPU objects, and compiles nothing once it is built.
+//! A running session creates no GPU objects, and compiles nothing once it is built.
 #![allow(clippy::unwrap_used)] // a test may fail by panicking, in its helpers too
 
 use std::sync::Arc;
@@ -10,13 +10,13 @@ use flyrig_fusion::{
 };
 use flyrig_gpu::{GpuContext, testing::device};
 use flyrig_renderer::{GaussianBuffers, Outputs, RasterSettings, Rasterizer, RenderTarget, rgba8_from_target};
-use flyrig_types::{Camera, Frame, Image, Intrinsics, Isometry, Lens, Mask, PixelFormat, Pose, PoseTrack, Rig};
-use glam::{DVec2, DVec3};
+use flyrig_types::{Camera, Frame, Image, Intrinsics, Isometry, Mask, PixelFormat, Pose, PoseTrack, Rig};
+use glam::DVec3;
 
 const FRAME_NANOS: i64 = 33_000_000;
 const SIDE: u32 = 128;
 
-/// Looks at the middle of the body at the origin.
+/// Returns a camera that looks at the middle of the body at the origin, from 3 m away.
 fn camera(azimuth: f64, side: u32) -> Camera {
     let middle = DVec3::new(0.0, 0.9, 0.0);
     let eye = middle + DVec3::new(azimuth.sin(), 0.15, azimuth.cos()) * 3.0;
@@ -24,18 +24,12 @@ fn camera(azimuth: f64, side: u32) -> Camera {
         time_offset_nanos: 0,
         color: Default::default(),
         id: format!("{azimuth}").into(),
-        intrinsics: Intrinsics {
-            width: side,
-            height: side,
-            focal_px: DVec2::splat(1.2 * f64::from(side)),
-            center_px: DVec2::splat(0.5 * f64::from(side) - 0.5),
-            lens: Lens::PINHOLE,
-        },
+        intrinsics: Intrinsics::pinhole(side, side, 1.2 * f64::from(side)),
         camera_from_world: Isometry::look_at(eye, middle, DVec3::Y),
     }
 }
 
-/// A person who sways, and is displaced by `shift`; drawn on a device of its own.
+/// Person who sways and is displaced by `shift`, rendered on a device of its own.
 struct Scene {
     gpu: GpuContext,
     template: Template,
@@ -74,7 +68,7 @@ impl Scene {
         SessionBuilder::new(gpu.clone(), self.rig.clone()).settings(settings).perception(perception).build().unwrap()
     }
 
-    /// The frames of one instant: each camera exposes a quarter of a frame after the one before it.
+    /// Returns one frame set: each camera exposes a quarter of a frame after the one before it.
     fn set(&self, frame: usize) -> FrameSet {
         let gpu = &self.gpu;
         let count = self.surface.len();

@@ -1,14 +1,14 @@
 use super::*;
 
-/// A machine on which each level costs a share of the one before.
+/// Machine on which each level costs a share of the level before it.
 struct Machine {
     budget: Budget,
     random: u32,
-    /// Share of each level's cost in that of the one before.
+    /// Cost of each level as a share of that of the level before it.
     steps: [f64; LEVELS],
 }
 
-/// Levels and time of some sets.
+/// Levels and total time of some frame sets.
 struct Course {
     levels: Vec<usize>,
     secs: f64,
@@ -31,7 +31,7 @@ impl Machine {
         Self { budget: Budget::new(BudgetSettings { fps, effort: None }), random: 9, steps }
     }
 
-    /// Sets that would cost `full(i)` seconds with all the work, give or take a quarter.
+    /// Runs frame sets that would cost `full(i)` seconds with all the work, give or take a quarter.
     fn run(&mut self, sets: u32, full: impl Fn(u32) -> f64) -> Course {
         let mut course = Course { levels: Vec::new(), secs: 0.0 };
         for i in 0..sets {

@@ -64,16 +64,10 @@ impl GaussianPainter {
     }
 
     /// Paints the Gaussians from the images of one frame set. Views that are not trusted paint nothing.
-    pub fn paint(
-        &mut self,
-        inputs: PaintInputs<'_>,
-        rasterizer: &mut Rasterizer,
-        clock: &mut StageClock,
-        stages: &mut StageTimes,
-    ) -> Result<(), FusionError> {
+    pub fn paint(&mut self, inputs: PaintInputs<'_>, tools: &mut PaintTools<'_>) -> Result<(), FusionError> {
         match self {
-            Self::Direct(direct) => direct.paint(inputs, rasterizer, clock, stages),
-            Self::Learned(learned) => learned.paint(inputs, rasterizer, clock, stages),
+            Self::Direct(direct) => direct.paint(inputs, tools),
+            Self::Learned(learned) => learned.paint(inputs, tools),
         }
     }
 
@@ -185,26 +179,14 @@ pub(super) struct DirectPainter {
 }
 
 impl DirectPainter {
-    fn paint(
-        &mut self,
-        inputs: PaintInputs<'_>,
-        rasterizer: &mut Rasterizer,
-        clock: &mut StageClock,
-        stages: &mut StageTimes,
-    ) -> Result<(), FusionError> {
+    fn paint(&mut self, inputs: PaintInputs<'_>, tools: &mut PaintTools<'_>) -> Result<(), FusionError> {
         self.painted.clear();
-        self.render_views(inputs, rasterizer, clock, stages)?;
-        self.update(inputs, clock, stages)
+        self.render_views(inputs, tools)?;
+        self.update(inputs, tools)
     }
 
     /// Renders canonical positions and the last colours into every view.
-    fn render_views(
-        &mut self,
-        inputs: PaintInputs<'_>,
-        rasterizer: &mut Rasterizer,
-        clock: &mut StageClock,
-        stages: &mut StageTimes,
-    ) -> Result<(), FusionError> {
+    fn render_views(&mut self, inputs: PaintInputs<'_>, tools: &mut PaintTools<'_>) -> Result<(), FusionError> {
         let PaintInputs { gpu, geometry, instants, views, .. } = inputs;
         let start = Instant::now();
         let settings = RasterSettings {
@@ -215,13 +197,13 @@ impl DirectPainter {
             self.fit_target(gpu, i, (view.image.width(), view.image.height()))?;
             let mut encoder = gpu.device.create_command_encoder(&Default::default());
             let gaussians = geometry.at(instants.of_view(i));
-            rasterizer.encode(gpu, &mut encoder, gaussians, view.camera, &settings, &self.visibility[i])?;
+            tools.rasterizer.encode(gpu, &mut encoder, gaussians, view.camera, &settings, &self.visibility[i])?;
             if i + 1 == views.len() {
-                clock.mark(&mut encoder, TimedStage::Visibility);
+                tools.clock.mark(&mut encoder, TimedStage::Visibility);
             }
             gpu.queue.submit([encoder.finish()]);
         }
-        clock.wait(gpu, TimedStage::Visibility, start, stages)
+        tools.clock.wait(gpu, TimedStage::Visibility, start, tools.stages)
     }
 
     /// Gives a view a target of its image's size.
@@ -239,12 +221,7 @@ impl DirectPainter {
     }
 
     /// Updates direct appearance from the trusted views.
-    fn update(
-        &mut self,
-        inputs: PaintInputs<'_>,
-        clock: &mut StageClock,
-        stages: &mut StageTimes,
-    ) -> Result<(), FusionError> {
+    fn update(&mut self, inputs: PaintInputs<'_>, tools: &mut PaintTools<'_>) -> Result<(), FusionError> {
         let PaintInputs { gpu, geometry, instants, views, images } = inputs;
         let start = Instant::now();
         self.painted.extend((0..views.len()).filter(|&i| geometry.is_trusted(i)));
@@ -259,13 +236,13 @@ impl DirectPainter {
             .collect();
         let mut encoder = gpu.device.create_command_encoder(&Default::default());
         if views.is_empty() {
-            clock.mark(&mut encoder, TimedStage::Visibility);
+            tools.clock.mark(&mut encoder, TimedStage::Visibility);
         }
         self.appearance.update(gpu, &mut encoder, geometry.gaussians(), &observing, &self.settings)?;
-        clock.mark(&mut encoder, TimedStage::Appearance);
-        clock.finish(&mut encoder);
+        tools.clock.mark(&mut encoder, TimedStage::Appearance);
+        tools.clock.finish(&mut encoder);
         gpu.queue.submit([encoder.finish()]);
-        clock.wait(gpu, TimedStage::Appearance, start, stages)
+        tools.clock.wait(gpu, TimedStage::Appearance, start, tools.stages)
     }
 
     fn observations(&self, gpu: &GpuContext) -> Result<Observations, FusionError> {
@@ -283,22 +260,16 @@ pub(super) struct LearnedPainter {
 }
 
 impl LearnedPainter {
-    fn paint(
-        &mut self,
-        inputs: PaintInputs<'_>,
-        rasterizer: &mut Rasterizer,
-        clock: &mut StageClock,
-        stages: &mut StageTimes,
-    ) -> Result<(), FusionError> {
+    fn paint(&mut self, inputs: PaintInputs<'_>, tools: &mut PaintTools<'_>) -> Result<(), FusionError> {
         let shown = &inputs.geometry.gaussians().color;
         self.colors.copy_to(inputs.gpu, shown);
-        self.direct.paint(inputs, rasterizer, clock, stages)?;
-        if clock.is_supported() {
+        self.direct.paint(inputs, tools)?;
+        if tools.clock.is_supported() {
             inputs.gpu.wait()?;
         }
         let start = Instant::now();
         shown.copy_to(inputs.gpu, &self.colors);
-        self.correct(inputs, start, stages)
+        self.correct(inputs, start, tools.stages)
     }
 
     /// Replaces the colours that are shown by those of the networks.

@@ -27,7 +27,7 @@ use super::{
     inputs::{InputImage, InputView, Inputs},
     instants::Instants,
     memory::PersonMemory,
-    painter::{GaussianPainter, PaintInputs},
+    painter::{GaussianPainter, PaintInputs, PaintTools},
     pose_curve::PoseCurve,
     schedule::Schedule,
     stage_clock::StageClock,
@@ -165,7 +165,7 @@ impl Subject {
         }
         let (geometry, instants, images) = (&self.geometry, &instants, &self.inputs);
         let inputs = PaintInputs { gpu, geometry, instants, views, images };
-        self.painter.paint(inputs, rasterizer, &mut self.clock, stages)
+        self.painter.paint(inputs, &mut PaintTools { rasterizer, clock: &mut self.clock, stages })
     }
 
     /// Adds the adapter's times of updates that were waited for.

@@ -1,4 +1,4 @@
-//! Geometry that nobody should have, through the whole chain.
+//! Degenerate geometry through the whole deformation.
 
 use flyrig_body::{DEFAULT_SIGMA2_M2, build_graph};
 use flyrig_types::Isometry;
@@ -11,7 +11,7 @@ struct Hard {
     name: &'static str,
     scene: fn(&mut SmallScene),
     shot: fn(&mut SceneShot),
-    /// Whether there is something to follow.
+    /// Whether there is anything to follow.
     moves: Option<bool>,
 }
 
@@ -34,7 +34,7 @@ fn look(scene: &mut SmallScene, eye: DVec3, target: DVec3) {
     }
 }
 
-/// Nothing hangs on node 0, and it has no neighbours.
+/// Scene in which no Gaussian hangs on node 0, which has no neighbours.
 fn isolate(scene: &mut SmallScene) {
     let graph = &mut scene.graph;
     graph.neighbors[0] = [0; 4];
@@ -48,7 +48,7 @@ fn isolate(scene: &mut SmallScene) {
     }
 }
 
-/// All Gaussians on node 2 are transparent.
+/// Scene in which all Gaussians on node 2 are transparent.
 fn hide(scene: &mut SmallScene) {
     for ((nodes, weights), color) in
         scene.graph.gaussian_nodes.iter().zip(&scene.graph.gaussian_weights).zip(&mut scene.colors)
