@@ -17,6 +17,9 @@ use crate::{
     settings::perception::{Origin, PerceptionSettings},
 };
 
+/// Mask of all people in one frame, and the foreground colours along its outline.
+type EdgedMask = (Option<Mask>, Vec<EdgeColor>);
+
 /// Person with a known motion.
 #[derive(Debug, Clone)]
 pub struct GivenPerson {
@@ -132,7 +135,7 @@ impl Perception for GivenPerception {
 
     fn observe(&mut self, set: &FrameSet, stages: &mut StageTimes) -> Result<Vec<PersonObservation>, FusionError> {
         let poses: Vec<Pose> = self.people.iter().map(|given| given.at(set.master_nanos)).collect();
-        let (masks, edge_colors) = self.masks(set, &poses, stages)?;
+        let (masks, edge_colors): (Vec<_>, Vec<_>) = self.masks(set, &poses, stages)?.into_iter().unzip();
         if self.masks == Origin::Estimated
             && self.watch.is_due(self.backgrounds.iter().flatten().any(Background::is_learning))
         {
@@ -192,25 +195,18 @@ impl GivenPerception {
     }
 
     /// Returns the mask of all people in each present frame, and the foreground colours along its outline.
-    fn masks(
-        &self,
-        set: &FrameSet,
-        poses: &[Pose],
-        stages: &mut StageTimes,
-    ) -> Result<(Vec<Option<Mask>>, Vec<Vec<EdgeColor>>), FusionError> {
-        let (mut masks, mut edge_colors) = (Vec::new(), Vec::new());
+    fn masks(&self, set: &FrameSet, poses: &[Pose], stages: &mut StageTimes) -> Result<Vec<EdgedMask>, FusionError> {
+        let mut masks = Vec::new();
         for (slot, frame) in set.present() {
-            let (mask, colors) = match self.masks {
+            masks.push(match self.masks {
                 Origin::Given => (frame.mask.clone(), Vec::new()),
                 Origin::Estimated => {
                     let made = stages.time("mask from plate", || self.estimated_mask(slot, frame, poses))?;
                     made.map_or_else(Default::default, |Matte { mask, colors }| (Some(mask), colors))
                 }
-            };
-            masks.push(mask);
-            edge_colors.push(colors);
+            });
         }
-        Ok((masks, edge_colors))
+        Ok(masks)
     }
 
     /// Returns vertices, world metres, and triangles of all people with valid poses at the time of a frame.

@@ -29,11 +29,18 @@ pub(super) struct PaintInputs<'a> {
     pub images: &'a Inputs,
 }
 
-/// GaussianPainter of a person's Gaussians.
+/// Rasteriser and clocks of a painting.
+pub(super) struct PaintTools<'a> {
+    pub rasterizer: &'a mut Rasterizer,
+    pub clock: &'a mut StageClock,
+    pub stages: &'a mut StageTimes,
+}
+
+/// Painter of a person's Gaussians.
 #[derive(Debug)]
 pub(super) enum GaussianPainter {
     /// Colours projected from the images, diffused and remembered.
-    Direct(DirectPainter),
+    Direct(Box<DirectPainter>),
     /// Direct colours corrected by networks.
     Learned(Box<LearnedPainter>),
 }
@@ -54,7 +61,7 @@ impl GaussianPainter {
             visibility: Vec::new(),
             painted: Vec::new(),
         };
-        let Some(parameters) = settings.appearance.load_networks()? else { return Ok(Self::Direct(direct)) };
+        let Some(parameters) = settings.appearance.load_networks()? else { return Ok(Self::Direct(Box::new(direct))) };
         direct.appearance.keep_observations(gpu)?;
         let mut networks = LearnedAppearance::new(&parameters, body.clone());
         networks.reuse = settings.appearance.reuse;
@@ -91,18 +98,18 @@ impl GaussianPainter {
         self.direct().observations(gpu)
     }
 
-    /// Reads back the accumulated linear RGB of each Gaussian with its weight, then the direct colours. `shown` are the Gaussians as
-    /// they are drawn.
-    pub fn memory(
-        &self,
-        gpu: &GpuContext,
-        shown: &GaussianBuffers,
-    ) -> Result<(Vec<[f32; 4]>, Vec<[f32; 4]>), FusionError> {
+    /// Reads back the accumulated linear RGB of each Gaussian with its weight.
+    pub fn memory(&self, gpu: &GpuContext) -> Result<Vec<[f32; 4]>, FusionError> {
+        Ok(self.direct().appearance.memory(gpu)?)
+    }
+
+    /// Reads back the direct colours of the Gaussians: linear RGB and opacity. `shown` are the Gaussians as they are drawn.
+    pub fn direct_colors(&self, gpu: &GpuContext, shown: &GaussianBuffers) -> Result<Vec<[f32; 4]>, FusionError> {
         let colors = match self {
             Self::Direct(_) => &shown.color,
             Self::Learned(learned) => &learned.colors,
         };
-        Ok((self.direct().appearance.memory(gpu)?, colors.read(gpu)?))
+        Ok(colors.read(gpu)?)
     }
 
     /// Returns a copy of what networks have accumulated; `None` without any.

@@ -23,7 +23,8 @@ impl Subject {
     pub(crate) fn memory(&self, gpu: &GpuContext) -> Result<PersonMemory, FusionError> {
         let translations = self.node_translations().to_vec();
         let networks = self.painter.network_memory();
-        let (memory, colors) = self.painter.memory(gpu, self.geometry.gaussians())?;
+        let memory = self.painter.memory(gpu)?;
+        let colors = self.painter.direct_colors(gpu, self.gaussians())?;
         Ok(PersonMemory::new((self.body(), self.outfit()), translations, memory, colors, networks))
     }
 
