@@ -18,6 +18,19 @@
 //! | poses, masks and images to Gaussians | `session`, `subject`, `deformation` |
 //! | Gaussians to views, streams and statistics | `publish` |
 //! | steps, look-ahead and recovery of a live rig | `live` |
+//!
+//! # Threads
+//!
+//! | thread | task | number |
+//! |---|---|---|
+//! | caller of [`LiveRig::step`] ("pipeline") | everything else; owns the GPU queue | one |
+//! | "perception" | observes the next frame set beside the pipeline | one, per frame set |
+//! | "shape", "new person" | measures a person who has come, prepares the subject | one each per such person, for seconds |
+//! | "encode" | compresses views | one |
+//! | "person" | encodes the person stream | one |
+//!
+//! Queues between threads are bounded. A slow stage loses the oldest entry, counts it, and the count is published. Threads that compress
+//! and publish are restarted after a panic, five times at once; a panic of the pipeline builds the session again.
 
 mod deformation;
 mod error;

@@ -5,6 +5,8 @@
 //! `tracker::DeformTracker` turns the image residuals into steps of the deformation graph's nodes; it knows no GPU and sees the images
 //! only through its data term. The nodes then move all Gaussians and the template's vertices ([`motion`]).
 //!
+//! Where no camera looks, clothes are as thick as on the seen part of the same limb; head, hands and feet are stiffer than clothes.
+//!
 //! Resolution ([`area`]) and number of Gaussians ([`options`]) are bounded by what is informative, and of many views those from the most
 //! different directions are compared ([`view_choice`]). `stability_tests.rs` runs the chain beside a plain f64 copy of itself: a change to
 //! the loss, the solver or the choice of images changes that copy too.

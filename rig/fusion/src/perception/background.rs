@@ -1,4 +1,6 @@
 //! Backgrounds of a rig's cameras, from plates or a key colour: creation, schedule of updates, and warnings that name the camera.
+//!
+//! A background is updated with every fourth frame set, and with every one while it is being learnt.
 
 use flyrig_tracker::{Background, BackgroundEvent};
 use flyrig_types::{Camera, Image};

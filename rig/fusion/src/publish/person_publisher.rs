@@ -1,5 +1,6 @@
 //! Encoding and publishing of the person stream, on a thread of its own.
 //!
+//! With `output.avatar` the template of the first person is the avatar itself, and every frame is a pose: no node translations, no colours.
 //! While a viewer subscribes, each frame set yields one [`PersonFrame`] per person. Motion is published before the colours, which take
 //! longer to encode. Templates are offered by their hash; viewers fetch each once.
 

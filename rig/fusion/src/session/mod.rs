@@ -4,6 +4,10 @@
 //! person; the reconstruction hands each observation to its [`Subject`]. Perception never reads a reconstruction, so
 //! [`crate::LiveRig`] runs the perception of the next frame set beside the reconstruction of this one, with equal results.
 //!
+//! A person who is not found keeps the last state, and the loss is counted. Perception keeps what it knows of a person (landmarks, texture,
+//! clothes, hands); a new shape number makes the session build the person's subject again. Once a session has seen each image size, it
+//! creates no GPU object (`tests/steady_state.rs`).
+//!
 //! [`newcomers`] prepares the subjects of people who arrive: in place, or in threads beside the session. [`view_renderer`] renders all people
 //! into one view. With a budget, [`budget`] chooses the level of effort, and [`stillness`] leaves frame sets out while nothing moves.
 

@@ -1,4 +1,7 @@
 //! Geometry of one person: the deformation solved against the images, and the skinned Gaussians at each instant.
+//!
+//! The nodes of the deformation graph displace the canonical Gaussians, and `body::GpuSkinner` moves them to the world. Where nodes have
+//! moved apart (skirts, coats), Gaussians are larger.
 
 use std::time::Instant;
 

@@ -1,6 +1,7 @@
 //! Learnt shape, deformation and colours of a person.
 //!
-//! A session resumes from it after a restart of the program or the loss of the graphics device: [`crate::LiveRig`] reads it back every
+//! A memory can be saved and given to the [`crate::SessionBuilder`] of a later program, or made of an avatar
+//! ([`PersonMemory::of_colors`]). A session resumes from it after a restart of the program or the loss of the graphics device: [`crate::LiveRig`] reads it back every
 //! ten seconds. Files of it are in [`super::memory_file`].
 
 use std::sync::Arc;

@@ -1,4 +1,9 @@
 //! Colours of one person's Gaussians: direct appearance, and networks that correct it in the learned modes.
+//!
+//! Direct appearance is FlyHuman, Eq. 5-12, with linear RGB as the feature: pixel colours at the rendered surface, weighted by angle and
+//! canonical distance, sharpened by the residual of the rendered input views, diffused over the deformation graph for unseen parts, and
+//! remembered over time. Networks run on the processor, from observations read back from the GPU. Direct appearance continues from its own
+//! colours, never from those of the networks.
 
 use std::time::Instant;
 

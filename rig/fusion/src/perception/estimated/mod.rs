@@ -5,6 +5,9 @@
 //! again on a view only once the body has moved in it, and a lost person is searched for over several frame sets. `tracker::HandTracker`
 //! adds fingers and the turn of the head.
 //!
+//! A person who is not found keeps the last state in the session, and the loss is counted there. A single camera measures only a person's
+//! height, from where the feet stand. Shoes and a skirt are looked for once the shape is known.
+//!
 //! [`place`] is one person or a free place, and measures the shape from landmarks and outlines of eight frame sets; [`tracks`] assigns
 //! people to places; [`views`] makes the masks; [`backgrounds`] keeps the empty scene up to date.
 

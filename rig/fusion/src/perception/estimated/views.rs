@@ -1,4 +1,6 @@
 //! Masks of all people in every image, with coverage and colours along their outlines.
+//!
+//! `tracker::matte` solves for coverage and foreground colour along each outline; the session paints these colours in place of the image's.
 
 use std::{collections::BTreeMap, sync::Arc};
 
