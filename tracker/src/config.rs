@@ -2,10 +2,14 @@
 
 use serde::{Deserialize, Serialize};
 
+use crate::settings::PoseSettings;
+
 /// Settings of [`crate::PoseEstimator`]; the defaults suit a rig a few metres wide.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields, rename_all = "kebab-case", default)]
 pub struct PoseConfig {
+    /// Settings that users choose.
+    pub settings: PoseSettings,
     /// Crops whose presence is lower than this show no person, 0..1.
     pub presence_threshold: f64,
     /// Landmarks of lower confidence (the smaller of visibility and presence) are hidden: they prove nobody's presence and are not
@@ -20,19 +24,11 @@ pub struct PoseConfig {
     /// How often the outline of the body is matched with the masks, and its texture with the images, in a set; 0 fits the pose
     /// to landmarks alone.
     pub outline_rounds: usize,
-    /// Height of the person, metres; `None` measures it.
-    pub height_m: Option<f64>,
-    /// Height of the floor in the world, along the rig's up, metres. A single camera, without [`Self::height_m`], measures people by where
-    /// their feet stand.
-    pub floor_m: f64,
     /// Rounds in which [`crate::PoseEstimator::measure_shape`] matches outlines with masks to solve for lengths, girths, build and
     /// poses together; 0 fits bone lengths to landmarks alone (docs/benchmarks/perception.md, "Shape from outlines").
     pub shape_rounds: usize,
     /// Standard deviation of a joint's turn between sets at 30 sets a second, radians; smaller is smoother.
     pub smooth_rad: f64,
-    /// Distance that the body moves in a view until the network looks at that view again, metres; 0 looks at every view of
-    /// every set.
-    pub look_after_m: f64,
     /// Views with an earlier look that the network looks at again in a set at most, those that need it most; 0: all that need it.
     pub looks: usize,
     /// Largest number of solver steps a frame set.
@@ -48,17 +44,15 @@ pub struct PoseConfig {
 impl Default for PoseConfig {
     fn default() -> Self {
         Self {
+            settings: PoseSettings::default(),
             presence_threshold: 0.5,
             confidence_threshold: 0.3,
             inlier_m: 0.07,
             landmark_spread: 1.0,
             outline_sigma_m: 0.01,
             outline_rounds: 2,
-            height_m: None,
-            floor_m: 0.0,
             shape_rounds: 2,
             smooth_rad: 0.15,
-            look_after_m: 0.02,
             looks: 0,
             max_steps: 12,
             masks: true,

@@ -54,9 +54,9 @@ pub struct ShapeFit {
 pub enum HeightFrom {
     /// Two or more views.
     Measurement,
-    /// [`PoseConfig::height_m`].
+    /// [`PoseSettings::height_m`](crate::PoseSettings::height_m).
     Configuration,
-    /// Where the feet stand before a single camera, for a floor at this height ([`PoseConfig::floor_m`]).
+    /// Where the feet stand before a single camera, for a floor at this height ([`PoseSettings::floor_m`](crate::PoseSettings::floor_m)).
     Floor(f64),
     /// The template's: one camera cannot tell a tall person from a near one.
     Average,
@@ -173,7 +173,7 @@ pub fn fit_template_shape(
     factors.insert("scale".to_owned(), scale);
     let mut shaped = scale_template(template, &model, &factors)?;
     let mut height_from = HeightFrom::Measurement;
-    if let Some(height) = config.height_m {
+    if let Some(height) = config.settings.height_m {
         factors.insert("scale".to_owned(), scale * height / height_m(&shaped));
         shaped = scale_template(template, &model, &factors)?;
         height_from = HeightFrom::Configuration;

@@ -2,7 +2,7 @@
 
 use std::sync::Arc;
 
-use flyrig_fusion::{EstimatedPerception, Observation, Origin, Perception as _, PerceptionSettings, StageTimes};
+use flyrig_fusion::{EstimatedPerception, Origin, Perception as _, PerceptionSettings, PersonObservation, StageTimes};
 use flyrig_gpu::{AdapterChoice, GpuContext};
 use flyrig_sim::{MotionConfig, MotionKind, PersonConfig, RingConfig, SimConfig, Simulator};
 use flyrig_tracker::{HandConfig, HandTracker};
@@ -59,7 +59,7 @@ fn estimated_fingers_are_nearer_to_the_true_ones_than_the_relaxed_hand() {
         let truth = simulator.pose(nanos);
         let mut stages = StageTimes::default();
         let observed = perception.observe(&set, &mut stages).unwrap();
-        let [Observation::Seen(person)] = observed.as_slice() else { continue };
+        let [PersonObservation::Seen(person)] = observed.as_slice() else { continue };
         seen += 1;
         let (without, _) = relaxed.estimate(&set, &person.pose).unwrap();
         let off_mm = |pose: &Pose| {

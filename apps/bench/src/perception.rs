@@ -11,6 +11,7 @@ use flyrig_fusion::{BodySettings, Origin, Outcome, PerceptionSettings, PersonId,
 use flyrig_gpu::GpuContext;
 use flyrig_metrics::{CameraScore, ScoreSheet, score_view};
 use flyrig_report::{Replay, ReplaySettings, dataset, progress_bar, write_whole};
+use flyrig_tracker::PoseSettings;
 use flyrig_types::{Frame, FrameSet, Mask, Pose};
 use glam::{DQuat, DVec3};
 use serde::Serialize;
@@ -117,7 +118,10 @@ fn run(args: &BenchPerceptionArgs, folder: &Path, inputs: Inputs, gpu: &GpuConte
         pose: inputs.pose,
         shape: (inputs.pose == Origin::Estimated).then_some(inputs.shape),
         masks: inputs.masks,
-        look_after_m: args.look_after_m.unwrap_or(PerceptionSettings::default().look_after_m),
+        tracker: PoseSettings {
+            look_after_m: args.look_after_m.unwrap_or(PoseSettings::default().look_after_m),
+            ..PoseSettings::default()
+        },
         plates: args.plates.clone().unwrap_or_default(),
         network: args.network.clone().unwrap_or_default(),
         ..PerceptionSettings::default()

@@ -7,7 +7,9 @@ use std::{collections::BTreeMap, path::Path, sync::Arc};
 
 use anyhow::{Context, Result};
 use flyrig_body::{ShapeParams, default_template};
-use flyrig_fusion::{EstimatedPerception, Observation, Perception as _, PerceptionSettings, SeenPerson, StageTimes};
+use flyrig_fusion::{
+    EstimatedPerception, Perception as _, PerceptionSettings, PersonObservation, SeenPerson, StageTimes,
+};
 use flyrig_gpu::GpuContext;
 use flyrig_metrics::mask_iou;
 use flyrig_report::{paint_outline, png, progress_bar, write_whole};
@@ -285,8 +287,8 @@ fn run(args: &BenchStressArgs, gpu: &GpuContext, case: &Case, index: usize) -> R
         seconds += start.elapsed().as_secs_f64();
         bar.inc(1);
         let seen = observations.into_iter().find_map(|observation| match observation {
-            Observation::Seen(seen) => Some(seen),
-            Observation::Lost { .. } => None,
+            PersonObservation::Seen(seen) => Some(seen),
+            PersonObservation::Lost { .. } => None,
         });
         let known = perception.people();
         let Some(known) = known.first() else { continue };

@@ -5,7 +5,7 @@ use std::{collections::BTreeMap, time::Instant};
 use anyhow::{Context, Result};
 use flyrig_body::{ShapeParams, Template, default_template};
 use flyrig_fusion::{
-    EstimatedPerception, KnownPerson, Observation, Perception as _, PerceptionSettings, PersonId, StageTimes,
+    EstimatedPerception, KnownPerson, Perception as _, PerceptionSettings, PersonId, PersonObservation, StageTimes,
 };
 use flyrig_gpu::GpuContext;
 use flyrig_report::{progress_bar, write_whole};
@@ -156,7 +156,7 @@ fn run(args: &BenchTakesArgs, gpu: &GpuContext, seed: u64, sets: u64, bar: &indi
         let tracks: Vec<(PersonId, DVec3)> = observations
             .iter()
             .filter_map(|observation| {
-                let Observation::Seen(seen) = observation else { return None };
+                let PersonObservation::Seen(seen) = observation else { return None };
                 let template = |known: &&KnownPerson| known.person == seen.person;
                 Some((seen.person, hips(known.iter().find(template)?.template, &seen.pose)?))
             })

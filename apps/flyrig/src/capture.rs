@@ -73,7 +73,7 @@ pub fn capture(config: &Config, key: Option<&Path>, gpu: Option<&GpuContext>) ->
         }
         let publishing = publisher.thread();
         check_threads([publishing.clone()])?;
-        monitor.look(|| (Health { threads: vec![publishing], ..arrivals.health(&threads) }, None));
+        monitor.report(|| (Health { threads: vec![publishing], ..arrivals.health(&threads) }, None));
         if sent.is_none_or(|at| at.elapsed() >= STATUS_EVERY) {
             sent = Some(Instant::now());
             for camera in threads.stats() {

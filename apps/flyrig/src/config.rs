@@ -327,13 +327,18 @@ impl Config {
     }
 }
 
-/// Of a "unknown field `x`, expected one of `a`, `b`" message the listed key closest to `x`.
+/// Returns the key closest to `x` in a message "unknown field `x`, expected one of `a`, `b`": among the listed ones, else among all.
 fn nearest_key(message: &str) -> Option<String> {
     let mut quoted = message.split('`').skip(1).step_by(2);
     let unknown = quoted.next().filter(|_| message.starts_with("unknown"))?;
-    quoted
-        .max_by(|a, b| strsim::jaro_winkler(unknown, a).total_cmp(&strsim::jaro_winkler(unknown, b)))
-        .map(str::to_owned)
+    let likeness = |key: &str| strsim::jaro_winkler(unknown, key);
+    if let Some(listed) = quoted.max_by(|a, b| likeness(a).total_cmp(&likeness(b))) {
+        return Some(listed.to_owned());
+    }
+    // Tables that hold the settings of another crate list no keys.
+    let tables = toml::Table::try_from(Config::default()).ok()?;
+    let keys = tables.values().filter_map(toml::Value::as_table).flat_map(toml::Table::keys);
+    keys.max_by(|a, b| likeness(a).total_cmp(&likeness(b))).cloned()
 }
 
 #[cfg(test)]
@@ -382,6 +387,9 @@ mod tests {
         assert!(error.contains("line 3"), "{error}");
         assert!(error.contains("unknown field `max_wait`"), "{error}");
         assert!(error.ends_with("did you mean `max_wait_ms`?"), "{error}");
+        let error = Config::parse("[perception]\nfloor = 1.0\n").unwrap_err().to_string();
+        assert!(error.contains("unknown field `floor`"), "{error}");
+        assert!(error.ends_with("did you mean `floor_m`?"), "{error}");
         let error = Config::parse("[apearance]\n").unwrap_err().to_string();
         assert!(error.ends_with("did you mean `appearance`?"), "{error}");
     }

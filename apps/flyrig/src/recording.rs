@@ -207,7 +207,7 @@ pub fn record(config: &Config, args: &RecordArgs, gpu: Option<&GpuContext>) -> R
                 break;
             }
         }
-        monitor.look(|| (arrivals.health(&threads), Some(recorder.state())));
+        monitor.report(|| (arrivals.health(&threads), Some(recorder.state())));
         if printed.elapsed() >= PRINT_EVERY {
             let state = recorder.state();
             eprintln!("record: {} frames, {:.1} MB", state.frames, state.bytes as f64 / 1e6);

@@ -136,7 +136,7 @@ fn capture_people(
     };
     let mut session = monitor.during(gpu, || builder.build())?;
     if config.source.real_time {
-        session.work_beside();
+        session.use_threads();
     }
     let publisher = Publisher::open(&config.transport())?;
     publisher.set_calibration(session.rig())?;
@@ -187,7 +187,7 @@ fn capture_people(
         if step.is_some() {
             monitor.stepped();
         }
-        monitor.look(|| (rig.health(), recorder.map(Recorder::state)));
+        monitor.report(|| (rig.health(), recorder.map(Recorder::state)));
         let Some(step) = step else { continue };
         if let (Some(event), Some([messages, calibrations])) = (&step.watched, &mut watched) {
             messages.record(event.nanos, recording::log("watch", event.to_string())?);

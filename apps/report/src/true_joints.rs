@@ -2,7 +2,7 @@
 
 use flyrig_body::Template;
 use flyrig_fusion::{
-    Effort, EstimatedPerception, FusionError, KnownPerson, Observation, Perception, SeenPerson, StageTimes,
+    Effort, EstimatedPerception, FusionError, KnownPerson, Perception, PersonObservation, SeenPerson, StageTimes,
 };
 use flyrig_types::{FrameSet, Pose, PoseTrack};
 use glam::DQuat;
@@ -50,12 +50,14 @@ impl Perception for TrueJoints {
         self.inner.people()
     }
 
-    fn observe(&mut self, set: &FrameSet, stages: &mut StageTimes) -> Result<Vec<Observation>, FusionError> {
+    fn observe(&mut self, set: &FrameSet, stages: &mut StageTimes) -> Result<Vec<PersonObservation>, FusionError> {
         let truth = self.track.at(set.master_nanos);
         let observed = self.inner.observe(set, stages)?;
         let mixed = observed.into_iter().map(|observation| match observation {
-            Observation::Seen(seen) => Observation::Seen(SeenPerson { pose: self.mix(&seen.pose, &truth), ..seen }),
-            lost @ Observation::Lost { .. } => lost,
+            PersonObservation::Seen(seen) => {
+                PersonObservation::Seen(SeenPerson { pose: self.mix(&seen.pose, &truth), ..seen })
+            }
+            lost @ PersonObservation::Lost { .. } => lost,
         });
         Ok(mixed.collect())
     }

@@ -4,19 +4,20 @@
 
 use std::error::Error;
 
-use flyrig_body::{ShapeParams, default_template};
-use flyrig_fusion::{BodySettings, GivenPerception, PersonId, SessionBuilder, SessionSettings};
-use flyrig_gpu::{AdapterChoice, GpuContext};
-use flyrig_renderer::Splat;
-use flyrig_sync::{SyncSettings, Synchronizer};
-use flyrig_types::{
-    Camera, CameraId, Frame, Image, Intrinsics, Isometry, Lens, Mask, PixelFormat, PoseTrack, RenderedView, Rig,
+use flyrig_fusion::{
+    BodySettings, GivenPerception, PersonId, SessionBuilder, SessionSettings, Splat,
+    body::{ShapeParams, default_template},
+    glam::{DVec2, DVec3},
+    gpu::{AdapterChoice, GpuContext},
+    sync::{SyncSettings, Synchronizer},
+    types::{
+        Camera, CameraId, Frame, Image, Intrinsics, Isometry, Lens, Mask, PixelFormat, PoseTrack, RenderedView, Rig,
+    },
 };
-use glam::{DVec2, DVec3};
 
 const SIZE: u32 = 160;
 
-/// A calibrated camera on a circle of 3 m around the person; the world is y up here.
+/// Returns a calibrated camera on a circle of 3 m around the person; the world is y up here.
 fn camera(name: &str, degrees: f64) -> Camera {
     let (sin, cos) = degrees.to_radians().sin_cos();
     let middle = DVec3::new(0.0, 0.85, 0.0);
@@ -30,7 +31,7 @@ fn camera(name: &str, degrees: f64) -> Camera {
     }
 }
 
-/// Three images of a person in, the person's Gaussians and a view from a fourth side out.
+/// Reconstructs a person from three cameras; returns the person's Gaussians and a view from a fourth side.
 ///
 /// # Errors
 /// When the adapter, the calibration or an image cannot be used.
@@ -38,7 +39,7 @@ pub fn run() -> Result<(Vec<Splat>, RenderedView), Box<dyn Error>> {
     let rig = Rig { cameras: vec![camera("a", 0.0), camera("b", 120.0), camera("c", 240.0)], world_up: DVec3::Y };
     let ids: Vec<CameraId> = rig.cameras.iter().map(|camera| camera.id.clone()).collect();
 
-    // Here the pose is known: the built-in body stands still. `EstimatedPerception` finds pose and masks in the images.
+    // The pose is known here: the built-in body stands still. `EstimatedPerception` finds pose and masks in the images.
     let template = default_template(&ShapeParams::default())?;
     let track =
         PoseTrack::new(vec![(0, template.skeleton.rest_pose()), (1_000_000_000, template.skeleton.rest_pose())])?;
@@ -63,9 +64,9 @@ pub fn run() -> Result<(Vec<Splat>, RenderedView), Box<dyn Error>> {
                 image: Image::new(SIZE, SIZE, PixelFormat::Rgb8, rgb)?,
                 mask: Some(Mask::new(SIZE, SIZE, silhouette)?),
             };
-            // Frames of one instant come out as a set, in whatever order the cameras deliver.
+            // Frames of one instant come out as a frame set, in any order in which the cameras deliver them.
             for set in sync.push(frame) {
-                println!("set {}: {:?}", set.index, session.process(&set)?);
+                println!("frame set {}: {:?}", set.index, session.process(&set)?);
             }
         }
     }

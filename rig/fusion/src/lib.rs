@@ -1,67 +1,110 @@
 //! The live system as a library: frame sets in, tracked people as 3D Gaussians and rendered views out.
 //!
-//! A [`Session`] holds any number of [`Subject`]s, one a person. [`SessionBuilder`] makes one from a graphics device, the
-//! calibrated input cameras and a [`Perception`], which finds people in frame sets. [`Session::process`] takes in a
-//! [`FrameSet`]; [`Session::render`] draws everybody into a view; [`Session::splats`] reads a person's Gaussians back.
-//! Sets are formed by [`Intake`] from live cameras, by [`SetReader`] from recordings, or by a
-//! [`flyrig_sync::Synchronizer`] from any frames.
+//! A [`Session`] holds any number of [`Subject`]s, one per person. [`SessionBuilder`] creates one from a graphics device, the calibrated
+//! input cameras and a [`Perception`], which finds people in frame sets. [`Session::process`] processes a [`FrameSet`];
+//! [`Session::render`] renders all people into a view; [`Session::splats`] reads a person's Gaussians back. Frame sets are formed by
+//! [`Intake`] from live cameras, by [`SetReader`] from recordings, or by a [`sync::Synchronizer`] from any frames. [`LiveRig`] joins
+//! cameras, session and publisher, and recovers from faults.
 //!
-//! `examples/embed.rs` shows all of it without network, files or command line.
+//! Embedding programs depend on this crate alone: [`body`], [`calib`], [`capture`], [`gpu`], [`sync`], [`types`] and [`glam`] are the
+//! parts of the other crates that its interface needs. `examples/embed.rs` shows all of it without network, files or command line.
+//!
+//! # One frame set
+//!
+//! | step | module |
+//! |---|---|
+//! | frames of the cameras to a frame set | `intake` |
+//! | frame set to poses and masks of people | `perception` |
+//! | poses, masks and images to Gaussians | `session`, `subject`, `deformation` |
+//! | Gaussians to views, streams and statistics | `publish` |
+//! | steps, look-ahead and recovery of a live rig | `live` |
+//!
+//! # Threads
+//!
+//! | thread | task | number |
+//! |---|---|---|
+//! | caller of [`LiveRig::step`] ("pipeline") | everything else; owns the GPU queue | one |
+//! | "perception" | observes the next frame set beside the pipeline | one, per frame set |
+//! | "shape", "new person" | measures a person who has come, prepares the subject | one each per such person, for seconds |
+//! | "encode" | compresses views | one |
+//! | "person" | encodes the person stream | one |
+//!
+//! Queues between threads are bounded. A slow stage loses the oldest entry, counts it, and the count is published. Threads that compress
+//! and publish are restarted after a panic, five times at once; a panic of the pipeline builds the session again.
 
-mod age;
-mod budget;
 mod deformation;
-mod drawing;
-mod effort;
 mod error;
 mod health;
 mod intake;
-mod live_publisher;
-mod live_rig;
-mod live_views;
-mod memory;
-mod newcomers;
-mod perceiver;
+mod live;
 mod perception;
-mod person_stream;
-mod pose_curve;
-mod rig_watch;
+mod publish;
 mod session;
-mod set_reader;
 mod settings;
-mod stage_times;
-mod stage_trace;
-mod stillness;
 mod subject;
-mod track_state;
-mod viewpoints;
 
-pub use budget::Budget;
 pub use deformation::{DeformOptions, PAPER_COLOR_WEIGHT};
-pub use effort::Effort;
 pub use error::FusionError;
-pub use health::{CameraHealth, Health, STUCK_AFTER, check_threads};
-pub use intake::{InputFormat, Intake};
-pub use live_publisher::LivePublisher;
-pub use live_rig::{LiveRig, LiveStep};
-pub use live_views::{LiveViews, OutputSettings};
-pub use memory::PersonMemory;
-pub use perception::{
-    EstimatedPerception, GivenPerception, GivenPerson, KnownPerson, Observation, Perception, SHAPE_SECS, SHAPE_SETS,
-    SeenPerson, ViewObservation,
+pub use health::{
+    CameraHealth, Health, STUCK_AFTER, StageSummary, StageTimes, TracedStage, check_threads, processor_time,
+    resident_mib, start_stage_trace, take_stage_trace,
 };
-pub use person_stream::{PersonEncoder, PersonFrame, PersonMessages, stream_joints};
-pub use rig_watch::{Correction, RigWatch, WatchEvent};
-pub use session::{Counts, Outcome, Session, SessionBuilder};
-pub use set_reader::{SetReader, next_frame};
+pub use intake::{InputFormat, Intake, SetReader, next_frame};
+pub use live::{Correction, LiveRig, LiveStep, RigWatch, WatchEvent};
+pub use perception::{
+    EstimatedPerception, GivenPerception, GivenPerson, KnownPerson, Perception, PersonObservation, SHAPE_SECS,
+    SHAPE_SETS, SeenPerson, ViewObservation,
+};
+pub use publish::{LivePublisher, LiveViews, OutputSettings, PersonEncoder, PersonMessages, orbit};
+pub use session::{Budget, Counts, Outcome, Session, SessionBuilder};
 pub use settings::{
-    AppearanceMode, AppearanceOptions, BodySettings, BudgetSettings, NetworksOn, Origin, PerceptionSettings,
+    AppearanceMode, AppearanceOptions, BodySettings, BudgetSettings, Effort, NetworksOn, Origin, PerceptionSettings,
     SessionSettings, Solver, TrackingSettings,
 };
-pub use stage_times::{StageSummary, StageTimes, processor_time, resident_mib};
-pub use stage_trace::{TracedStage, start_stage_trace, take_stage_trace};
-pub use subject::{Observed, PROCESSOR_STAGE, Subject, person_gaussians, person_surface};
-pub use track_state::{Remedy, TrackState, TrackWatch};
-pub use viewpoints::orbit;
+pub use subject::{
+    Observed, PROCESSOR_STAGE, PersonFrame, PersonMemory, Remedy, Subject, TrackState, TrackWatch, person_gaussians,
+    person_surface, stream_joints,
+};
 
+pub use flyrig_renderer::Splat;
 pub use flyrig_types::{FrameSet, PersonId};
+pub use glam;
+
+/// Template bodies: the built-in one, and skinned glTF files.
+pub mod body {
+    pub use flyrig_body::{BodyError, Outfit, ShapeParams, Template, default_template, load_gltf};
+}
+
+/// Calibrations of the input cameras.
+pub mod calib {
+    pub use flyrig_calib::{CalibError, load_calibration};
+}
+
+/// Cameras and recordings.
+pub mod capture {
+    #[cfg(target_os = "linux")]
+    pub use flyrig_capture::V4l2Camera;
+    pub use flyrig_capture::{
+        CameraControls, CameraIdentity, CameraOptions, CameraSource, CaptureError, CaptureErrorKind, FolderOptions,
+        FolderReplay, FormatChoice, McapReplay, NokhwaCamera, NokhwaOptions, Pacing, SourceOpener, VideoOptions,
+        VideoReplay, folder_image_size,
+    };
+}
+
+/// Graphics device.
+pub mod gpu {
+    pub use flyrig_gpu::{AdapterChoice, GpuContext, GpuError};
+}
+
+/// Formation of frame sets.
+pub mod sync {
+    pub use flyrig_sync::{ClockKind, SyncSettings, Synchronizer};
+}
+
+/// Frames, cameras, poses and masks.
+pub mod types {
+    pub use flyrig_types::{
+        Camera, CameraId, Frame, FrameSet, Image, Intrinsics, Isometry, Lens, Mask, PersonId, PixelFormat, Pose,
+        PoseTrack, RenderedView, Rig,
+    };
+}

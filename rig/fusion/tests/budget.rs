@@ -1,4 +1,4 @@
-//! Under a budget sets in which nothing moves are left out, and work that a level of effort does without.
+//! A budget leaves out frame sets in which nothing moves, and the work that a level of effort does without.
 #![allow(clippy::unwrap_used)] // a test may fail by panicking
 
 mod support;
@@ -17,7 +17,7 @@ fn session(budget: BudgetSettings) -> Session {
     SessionBuilder::new(gpu(), rig).settings(settings).perception(person).build().unwrap()
 }
 
-/// A set a millisecond after the one before: whatever it costs, the next ones come before that time has passed often.
+/// Returns a frame set one millisecond after the one before it. Whatever it costs, several follow before eight times that cost has passed.
 fn set(index: u64, images: &[(Vec<u8>, Vec<u8>)]) -> FrameSet {
     FrameSet { master_nanos: index as i64 * 1_000_000, ..frame_set(index, images) }
 }

@@ -1,4 +1,4 @@
-//! The loss of the graphics device costs a moment, not what was learnt about the person.
+//! Losing the graphics device costs a moment, but not the person's memory.
 #![allow(clippy::unwrap_used)] // a test may fail by panicking
 
 mod support;

@@ -1,9 +1,25 @@
-//! The example runs, and its output is what an embedding program is promised.
+//! The example runs, depends on `flyrig-fusion` alone, and its output is as promised to embedding programs.
 #![allow(clippy::unwrap_used)] // a test may fail by panicking
+
+/// Source of the example.
+const SOURCE: &str = include_str!("../examples/embed.rs");
 
 #[path = "../examples/embed.rs"]
 #[allow(dead_code)]
 mod embed;
+
+#[test]
+fn an_embedding_program_depends_on_fusion_alone() {
+    let uses: Vec<&str> = SOURCE.lines().filter(|line| line.starts_with("use ")).collect();
+    assert!(
+        uses.iter().all(|line| ["use std::", "use flyrig_fusion::"].iter().any(|start| line.starts_with(start))),
+        "{uses:?}"
+    );
+    assert_eq!(SOURCE.matches("flyrig_").count(), 1, "in the import, and nowhere else");
+    let guide = include_str!("../../../docs/guide/embedding.md");
+    let crates = guide.lines().filter(|line| line.contains("flyrig_") && !line.contains("flyrig_fusion"));
+    assert_eq!(crates.collect::<Vec<_>>(), [""; 0]);
+}
 
 #[test]
 fn images_with_timestamps_become_gaussians_and_a_view() {

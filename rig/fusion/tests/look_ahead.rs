@@ -1,4 +1,4 @@
-//! A live rig observes the next set while it reconstructs the one before, with the results of one set after the other.
+//! A live rig observes the next frame set while it reconstructs the one before, with the results of strictly sequential processing.
 #![allow(clippy::unwrap_used)] // a test may fail by panicking
 
 mod support;
@@ -10,18 +10,18 @@ use std::{
 
 use flyrig_capture::Pacing;
 use flyrig_fusion::{
-    FusionError, GivenPerception, InputFormat, Intake, KnownPerson, LiveRig, LiveViews, Observation, Outcome,
-    OutputSettings, Perception, SessionBuilder, StageTimes,
+    FusionError, GivenPerception, InputFormat, Intake, KnownPerson, LiveRig, LiveViews, Outcome, OutputSettings,
+    Perception, PersonObservation, SessionBuilder, StageTimes,
 };
 use flyrig_sync::SyncSettings;
 use flyrig_types::{FrameSet, PersonId};
 
 use support::{frame_set, gpu, images, people, played, rig, settings};
 
-/// Index of each observed set, and name of the thread that observed it.
+/// Index of each observed frame set, and name of the thread that observed it.
 type Log = Arc<Mutex<Vec<(u64, String)>>>;
 
-/// Known people, and a log of who asked when.
+/// Perception of known people with a log of its calls.
 struct Logged {
     inner: GivenPerception,
     log: Log,
@@ -32,7 +32,7 @@ impl Perception for Logged {
         self.inner.people()
     }
 
-    fn observe(&mut self, set: &FrameSet, stages: &mut StageTimes) -> Result<Vec<Observation>, FusionError> {
+    fn observe(&mut self, set: &FrameSet, stages: &mut StageTimes) -> Result<Vec<PersonObservation>, FusionError> {
         let thread = std::thread::current().name().unwrap_or_default().to_owned();
         self.log.lock().unwrap().push((set.index, thread));
         self.inner.observe(set, stages)

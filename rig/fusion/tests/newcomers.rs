@@ -1,4 +1,4 @@
-//! People who arrive, or change their shape, while a session runs: beside its sets where it may.
+//! People who arrive, or change their shape, while a session runs: in place, or in threads beside it.
 #![allow(clippy::unwrap_used)] // a test may fail by panicking
 
 mod support;
@@ -7,7 +7,8 @@ use std::time::{Duration, Instant};
 
 use flyrig_body::Template;
 use flyrig_fusion::{
-    FusionError, GivenPerception, KnownPerson, Observation, Outcome, Perception, Session, SessionBuilder, StageTimes,
+    FusionError, GivenPerception, KnownPerson, Outcome, Perception, PersonObservation, Session, SessionBuilder,
+    StageTimes,
 };
 use flyrig_types::{FrameSet, PersonId};
 
@@ -15,7 +16,7 @@ use support::{frame_set, gpu, images, people, rig, settings};
 
 const PERSON: PersonId = PersonId(0);
 
-/// Somebody who is known after a number of sets, and has another shape after more.
+/// Perception of a person who is known after a number of frame sets, and has another shape after more.
 struct Late {
     inner: GivenPerception,
     seen: u64,
@@ -33,7 +34,7 @@ impl Perception for Late {
             .collect()
     }
 
-    fn observe(&mut self, set: &FrameSet, stages: &mut StageTimes) -> Result<Vec<Observation>, FusionError> {
+    fn observe(&mut self, set: &FrameSet, stages: &mut StageTimes) -> Result<Vec<PersonObservation>, FusionError> {
         self.seen += 1;
         let observed = self.inner.observe(set, stages)?;
         Ok(if self.seen >= self.known_after { observed } else { Vec::new() })
@@ -48,7 +49,7 @@ fn session(gaussians: usize, known_after: u64, other_after: u64) -> Session {
     SessionBuilder::new(gpu(), rig()).settings(settings(gaussians)).perception(perception).build().unwrap()
 }
 
-/// Takes the same set in again until it is used; returns how many were held, and why the last one was.
+/// Processes the same frame set until a person is updated; returns the number of held ones, and the reason of the last.
 fn until_updated(session: &mut Session, set: &FrameSet) -> (usize, String) {
     let (start, mut held, mut why) = (Instant::now(), 0, String::new());
     while let Outcome::Held(reason) = session.process(set).unwrap() {
@@ -62,9 +63,9 @@ fn until_updated(session: &mut Session, set: &FrameSet) -> (usize, String) {
 fn a_person_who_arrives_is_prepared_beside_the_sets_and_is_the_same_as_otherwise() {
     let set = frame_set(0, &images(&[(0.0, [220, 40, 30])]));
     let mut waiting = session(3000, 3, u64::MAX);
-    assert_eq!(until_updated(&mut waiting, &set).0, 2, "nobody is known in two sets");
+    assert_eq!(until_updated(&mut waiting, &set).0, 2, "no person is known in two frame sets");
     let mut beside = session(3000, 3, u64::MAX);
-    beside.work_beside();
+    beside.use_threads();
     let (held, why) = until_updated(&mut beside, &set);
     assert!(held > 2, "the set in which the person is new does not wait");
     assert_eq!(why, "person 0 is being prepared");
@@ -75,7 +76,7 @@ fn a_person_who_arrives_is_prepared_beside_the_sets_and_is_the_same_as_otherwise
 fn a_person_of_another_shape_is_shown_as_before_until_the_new_one_is_ready() {
     let set = frame_set(0, &images(&[(0.0, [220, 40, 30])]));
     let mut session = session(3000, 0, 3);
-    session.work_beside();
+    session.use_threads();
     let height = |session: &Session| {
         let positions = &session.subject(PERSON).unwrap().template().positions;
         positions.iter().map(|position| position.y).fold(0.0f32, f32::max)

@@ -1,4 +1,4 @@
-//! The learnt person outlives the program.
+//! A person's memory outlives the program.
 #![allow(clippy::unwrap_used)] // a test may fail by panicking
 
 mod support;
@@ -61,7 +61,7 @@ fn colors_known_beforehand_stay_where_nobody_looks_yield_to_images_and_return_af
     }
     let (unseen, seen) = (count(&session, blue), count(&session, green));
     assert!(unseen > 1000 && seen > 500, "{unseen} blue, {seen} green");
-    // Nobody is there for two seconds, and whoever comes back starts from blue again.
+    // No person is there for two seconds, and the one who comes back starts from blue again.
     let mut nobody = images.clone();
     nobody.iter_mut().for_each(|(_, mask)| mask.fill(0));
     session.process(&frame_set(10, &nobody)).unwrap();

@@ -1,4 +1,4 @@
-//! A panic in a thread of a live rig costs a moment; one that comes again and again ends the rig with its name.
+//! A panic in a thread of a live rig costs a moment; repeated panics end the rig with the thread's name.
 #![allow(clippy::unwrap_used, clippy::panic)] // a test may fail by panicking
 
 mod support;
@@ -7,8 +7,8 @@ use std::time::Duration;
 
 use flyrig_capture::Pacing;
 use flyrig_fusion::{
-    FusionError, GivenPerception, InputFormat, Intake, KnownPerson, LiveRig, LiveViews, Observation, Outcome,
-    OutputSettings, Perception, SessionBuilder, StageTimes,
+    FusionError, GivenPerception, InputFormat, Intake, KnownPerson, LiveRig, LiveViews, Outcome, OutputSettings,
+    Perception, PersonObservation, SessionBuilder, StageTimes,
 };
 use flyrig_sync::SyncSettings;
 use flyrig_types::{FrameSet, PersonId, SupervisedThread};
@@ -17,7 +17,7 @@ use support::{frame_set, gpu, images, people, played, rig, settings};
 
 const RED: [u8; 3] = [220, 40, 30];
 
-/// Finds people, but panics at some sets.
+/// Perception that panics at some frame sets.
 struct Unlucky {
     inner: GivenPerception,
     panics_at: fn(u64) -> bool,
@@ -28,13 +28,13 @@ impl Perception for Unlucky {
         self.inner.people()
     }
 
-    fn observe(&mut self, set: &FrameSet, stages: &mut StageTimes) -> Result<Vec<Observation>, FusionError> {
+    fn observe(&mut self, set: &FrameSet, stages: &mut StageTimes) -> Result<Vec<PersonObservation>, FusionError> {
         assert!(!(self.panics_at)(set.index), "set {}", set.index);
         self.inner.observe(set, stages)
     }
 }
 
-/// A rig of eight sets.
+/// Returns a rig with eight frame sets.
 fn live_rig(panics_at: fn(u64) -> bool) -> LiveRig {
     let images = images(&[(0.0, RED)]);
     let sets: Vec<FrameSet> = (0..8).map(|index| frame_set(index, &images)).collect();

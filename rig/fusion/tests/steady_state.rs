@@ -1,4 +1,4 @@
-//! A session that runs creates no GPU objects, and compiles nothing once it is built.
+//! A running session creates no GPU objects, and compiles nothing once it is built.
 #![allow(clippy::unwrap_used)] // a test may fail by panicking, in its helpers too
 
 use std::sync::Arc;
@@ -16,7 +16,7 @@ use glam::DVec3;
 const FRAME_NANOS: i64 = 33_000_000;
 const SIDE: u32 = 128;
 
-/// Looks at the middle of the body at the origin.
+/// Returns a camera that looks at the middle of the body at the origin, from 3 m away.
 fn camera(azimuth: f64, side: u32) -> Camera {
     let middle = DVec3::new(0.0, 0.9, 0.0);
     let eye = middle + DVec3::new(azimuth.sin(), 0.15, azimuth.cos()) * 3.0;
@@ -24,7 +24,7 @@ fn camera(azimuth: f64, side: u32) -> Camera {
     Camera::new(format!("{azimuth}"), intrinsics, Isometry::look_at(eye, middle, DVec3::Y))
 }
 
-/// A person who sways, and is displaced by `shift`; drawn on a device of its own.
+/// Person who sways and is displaced by `shift`, rendered on a device of its own.
 struct Scene {
     gpu: GpuContext,
     template: Template,
@@ -63,7 +63,7 @@ impl Scene {
         SessionBuilder::new(gpu.clone(), self.rig.clone()).settings(settings).perception(perception).build().unwrap()
     }
 
-    /// The frames of one instant: each camera exposes a quarter of a frame after the one before it.
+    /// Returns one frame set: each camera exposes a quarter of a frame after the one before it.
     fn set(&self, frame: usize) -> FrameSet {
         let gpu = &self.gpu;
         let count = self.surface.len();

@@ -25,7 +25,7 @@ fn blue(c: &[f32; 3]) -> bool {
     c[2] > 2.0 * c[0]
 }
 
-/// Mean distance between the Gaussians of two sessions' people, metres.
+/// Returns the mean distance between the Gaussians of two sessions' people, metres.
 fn apart(a: &Session, person: u32, b: &Session, other: u32) -> f64 {
     let (a, b) = (a.splats(PersonId(person)).unwrap(), b.splats(PersonId(other)).unwrap());
     let distance =

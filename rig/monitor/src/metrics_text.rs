@@ -1,4 +1,4 @@
-//! Health of a rig for Prometheus.
+//! Metrics of a rig's health, as OpenMetrics text for Prometheus.
 
 use std::fmt;
 
@@ -29,22 +29,24 @@ pub fn prometheus(health: &Health, recorded: Option<&Recorded>) -> String {
     }
 }
 
-/// The state that one answer shows.
+/// State that one answer shows.
 #[derive(Debug)]
 struct Snapshot {
     health: Health,
     recorded: Option<Recorded>,
 }
 
-/// Name and help of a family, and its value for a camera that has one.
+/// Name and help of a family of counters, and its value for a camera that has one.
 type Counter = (&'static str, &'static str, fn(&CameraHealth) -> Option<u64>);
+/// Name and help of a family of gauges, and its value for a camera that has one.
 type Gauge = (&'static str, &'static str, fn(&CameraHealth) -> Option<f64>);
 
+/// Returns the state of the link to a camera's computer, where there is one.
 fn network(camera: &CameraHealth) -> Option<NetworkHealth> {
     camera.stats.health.network
 }
 
-/// Returns the state of the link to a camera's computer once its clock is known.
+/// Returns the state of the link to a camera's computer; `None` until its clock is known.
 fn with_clock(camera: &CameraHealth) -> Option<NetworkHealth> {
     network(camera).filter(|network| network.clock_offset_nanos.is_some())
 }
@@ -154,7 +156,7 @@ impl Collector for Snapshot {
     }
 }
 
-/// Writes families of metrics.
+/// Writer of families of metrics.
 struct Page<'a>(DescriptorEncoder<'a>);
 
 impl Page<'_> {

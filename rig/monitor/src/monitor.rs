@@ -1,4 +1,7 @@
-//! The health of a running command: once a second to the metrics page, the terminal's table and the service manager.
+//! Health of a running command: once per second to the metrics page, the terminal's table and the service manager.
+//!
+//! The service manager's watchdog is fed by steps of the pipeline; while a session is built, by the growing number of GPU objects; and not
+//! at all while a thread is stuck.
 
 use std::{
     collections::{BTreeMap, BTreeSet},
@@ -16,19 +19,36 @@ use flyrig_types::CameraId;
 
 use crate::{metrics_text, page_server::PageServer, table};
 
-/// How often the health is reported.
+/// Time from one report to the next.
 const EVERY: Duration = Duration::from_secs(1);
 
-/// Reports the health of a command from its first second to its last. Every loop of the command calls [`Self::look`].
+/// Reporter of a command's health, from its start to its end. Every loop of the command calls [`Self::report`].
+///
+/// # Example
+/// ```
+/// use flyrig_fusion::Health;
+/// use flyrig_monitor::Monitor;
+///
+/// // No metrics page, no table: only the log and the service manager.
+/// let mut monitor = Monitor::start("", false)?;
+/// Monitor::ready();
+/// for _ in 0..3 {
+///     monitor.stepped();
+///     monitor.report(|| (Health::default(), None));
+/// }
+/// # Ok::<(), Box<dyn std::error::Error>>(())
+/// ```
 pub struct Monitor {
     metrics: Option<PageServer>,
     show_table: bool,
-    looked: Option<Instant>,
+    /// Time of the last report.
+    reported: Option<Instant>,
     watchdog: Watchdog,
-    /// Restarts of threads, and whether they are stuck, as logged last.
+    /// Restarts of each thread, and whether it is stuck, as logged last.
     logged: BTreeMap<String, (u64, bool)>,
     /// Cameras that were reported as silent.
     silent: BTreeSet<CameraId>,
+    /// Status that the service manager has.
     status: String,
 }
 
@@ -48,39 +68,39 @@ impl Monitor {
             let health = Health { resident_mib: resident_mib(), ..Health::default() };
             metrics.publish(metrics_text::prometheus(&health, None));
         }
-        let (looked, watchdog, logged, silent) = Default::default();
-        Ok(Self { metrics, show_table, looked, watchdog, logged, silent, status: String::new() })
+        let (reported, watchdog, logged, silent) = Default::default();
+        Ok(Self { metrics, show_table, reported, watchdog, logged, silent, status: String::new() })
     }
 
-    /// Reports that the service is up: the watchdog is in force from here on.
+    /// Tells the service manager that the service is up. The watchdog is in force from here on.
     pub fn ready() {
         notify("READY=1");
     }
 
-    /// Reports that the pipeline made a step: a set of frames was processed.
+    /// Notes that the pipeline made a step: a frame set was processed.
     pub fn stepped(&mut self) {
         self.watchdog.stepped = true;
     }
 
-    /// Does work that makes no steps, such as building a session, and feeds the watchdog whenever the graphics device was given
-    /// something new to hold. Work that hangs is not fed for.
+    /// Runs work that makes no steps, such as building a session, and feeds the watchdog whenever the number of GPU objects has changed. Work
+    /// that hangs does not feed it.
     pub fn during<T>(&mut self, gpu: &GpuContext, work: impl FnOnce() -> T) -> T {
         let done = during(EVERY, || gpu.objects(), || notify("WATCHDOG=1"), work);
         self.stepped();
         done
     }
 
-    /// Reports the health, at most once a second; `snapshot` returns it and the state of a recording, if there is one.
-    pub fn look(&mut self, snapshot: impl FnOnce() -> (Health, Option<Recorded>)) {
-        if self.looked.is_some_and(|at| at.elapsed() < EVERY) {
+    /// Reports the health, at most once per second. `snapshot` returns it, with the state of a recording where there is one.
+    pub fn report(&mut self, snapshot: impl FnOnce() -> (Health, Option<Recorded>)) {
+        if self.reported.is_some_and(|at| at.elapsed() < EVERY) {
             return;
         }
         // After a long step frames wait to be taken, and their cameras are not to blame.
-        let was_busy = self.looked.is_some_and(|at| at.elapsed() > 2 * EVERY);
-        self.looked = Some(Instant::now());
+        let was_busy = self.reported.is_some_and(|at| at.elapsed() > 2 * EVERY);
+        self.reported = Some(Instant::now());
         let (health, recorded) = snapshot();
         self.log(&health, was_busy);
-        let (feeds, status) = self.watchdog.judge(&health);
+        let (feeds, status) = self.watchdog.assess(&health);
         if feeds {
             notify("WATCHDOG=1");
         }
@@ -97,6 +117,7 @@ impl Monitor {
         }
     }
 
+    /// Logs changes: silent cameras, restarts, and threads that are stuck or work again.
     fn log(&mut self, health: &Health, was_busy: bool) {
         for camera in &health.cameras {
             let name = &camera.stats.camera;
@@ -138,16 +159,16 @@ impl Drop for Monitor {
     }
 }
 
-/// Decides whether the service manager's watchdog is fed: by progress, not by time.
+/// Decision whether the service manager's watchdog is fed: by progress, not by time.
 #[derive(Debug, Default)]
 struct Watchdog {
-    /// Whether the pipeline made a step since the watchdog was fed last.
+    /// Whether the pipeline has made a step since the watchdog was last fed.
     stepped: bool,
 }
 
 impl Watchdog {
     /// Returns whether to feed the watchdog now, and the state in words.
-    fn judge(&mut self, health: &Health) -> (bool, String) {
+    fn assess(&mut self, health: &Health) -> (bool, String) {
         let ours = |thread: &&String| !thread.starts_with("open ");
         let stuck: Vec<&str> = health.stuck.iter().filter(ours).map(String::as_str).collect();
         if !stuck.is_empty() {
@@ -163,7 +184,7 @@ impl Watchdog {
     }
 }
 
-/// Does some work, and meanwhile looks at its progress again and again; `feed` is called whenever it has changed.
+/// Runs `work`, and meanwhile calls `feed` whenever `progress` has changed within `every`.
 fn during<P: PartialEq + Send, T>(
     every: Duration,
     progress: impl Fn() -> P + Send,
@@ -184,13 +205,13 @@ fn during<P: PartialEq + Send, T>(
             }
         };
         if let Err(error) = Builder::new().name("progress".to_owned()).spawn_scoped(scope, watch) {
-            tracing::warn!("nobody feeds the watchdog for a while, since the system gives no thread: {error}");
+            tracing::warn!("the watchdog is not fed for a while, since the system starts no thread: {error}");
         }
         work()
     })
 }
 
-/// Sends a state to the service manager, where there is one. One that does not listen must not hold the rig up.
+/// Sends a state to the service manager, where there is one. A service manager that does not listen must not hold up the rig.
 #[cfg(target_os = "linux")]
 fn notify(state: &str) {
     if let Err(error) = sd_notify::notify(&[sd_notify::NotifyState::Custom(&state.replace('\n', " "))]) {
@@ -198,7 +219,7 @@ fn notify(state: &str) {
     }
 }
 
-/// Only Linux has systemd.
+/// Does nothing: only Linux has systemd.
 #[cfg(not(target_os = "linux"))]
 fn notify(_state: &str) {}
 
@@ -209,35 +230,36 @@ pub fn ended_by_itself(cameras: &[CameraStats]) -> anyhow::Error {
     anyhow!("all cameras have ended{}", last_errors(&all))
 }
 
+/// Formats the cameras' last errors, after a colon; empty without any.
 fn last_errors(cameras: &[&CameraStats]) -> String {
     let errors: Vec<String> =
         cameras.iter().filter_map(|camera| camera.last_error.as_ref()).map(ToString::to_string).collect();
     if errors.is_empty() { String::new() } else { format!(": {}", errors.join("; ")) }
 }
 
-/// When frames of each camera came last, where no [`flyrig_fusion::Intake`] keeps account.
+/// Arrival of each camera's last frame, for commands without a [`flyrig_fusion::Intake`].
 pub struct Arrivals(Vec<(CameraId, Option<Instant>)>);
 
 impl Arrivals {
-    /// No frame has come yet.
+    /// Creates the state before any frame.
     pub fn new(cameras: &[CameraId]) -> Self {
         Self(cameras.iter().map(|camera| (camera.clone(), None)).collect())
     }
 
-    /// Notes a frame of a camera.
+    /// Notes the arrival of a camera's frame.
     pub fn add(&mut self, camera: &CameraId) {
         if let Some((_, at)) = self.0.iter_mut().find(|(known, _)| known == camera) {
             *at = Some(Instant::now());
         }
     }
 
-    /// Returns whether a camera gave no frame for so long.
+    /// Returns whether a camera has delivered no frame for at least this time.
     pub fn is_silent(&self, camera: &CameraId, longer_than: Duration) -> bool {
         let at = self.0.iter().find(|(known, _)| known == camera).and_then(|(_, at)| *at);
         at.is_none_or(|at| at.elapsed() >= longer_than)
     }
 
-    /// Returns the health of cameras of which no sets are made.
+    /// Returns the health of cameras whose frames form no frame sets.
     pub fn health(&self, threads: &CaptureThreads) -> Health {
         let camera = |(stats, (_, last)): (CameraStats, &(CameraId, Option<Instant>))| CameraHealth {
             stats,
@@ -268,16 +290,16 @@ mod tests {
     #[test]
     fn the_watchdog_is_fed_by_steps_alone_while_cameras_deliver() {
         let (mut watchdog, mut health) = (Watchdog::default(), health());
-        assert!(!watchdog.judge(&health).0, "frames come and nothing is made of them");
+        assert!(!watchdog.assess(&health).0, "frames come and nothing is made of them");
         watchdog.stepped = true;
-        assert_eq!(watchdog.judge(&health), (true, "1 of 1 cameras deliver frames".to_owned()));
-        assert!(!watchdog.judge(&health).0, "one step feeds once");
+        assert_eq!(watchdog.assess(&health), (true, "1 of 1 cameras deliver frames".to_owned()));
+        assert!(!watchdog.assess(&health).0, "one step feeds once");
         watchdog.stepped = true;
         health.stuck = vec!["open left".to_owned()];
-        assert!(watchdog.judge(&health).0, "opening a camera may take any time");
+        assert!(watchdog.assess(&health).0, "opening a camera may take any time");
         watchdog.stepped = true;
         health.stuck.push("stage left".to_owned());
-        assert_eq!(watchdog.judge(&health), (false, "stuck: stage left".to_owned()));
+        assert_eq!(watchdog.assess(&health), (false, "stuck: stage left".to_owned()));
     }
 
     #[test]
@@ -287,7 +309,7 @@ mod tests {
         let error = CaptureError::new(&"left".into(), CaptureErrorKind::NotFound, "is not plugged in");
         health.cameras[0].stats.last_error = Some(error);
         let expected = "no camera delivers frames: camera left: is not plugged in";
-        assert_eq!(watchdog.judge(&health), (true, expected.to_owned()));
+        assert_eq!(watchdog.assess(&health), (true, expected.to_owned()));
         let ended = ended_by_itself(&[health.cameras[0].stats.clone()]).to_string();
         assert_eq!(ended, "all cameras have ended: camera left: is not plugged in");
     }

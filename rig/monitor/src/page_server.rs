@@ -7,10 +7,9 @@ use std::{
     time::Duration,
 };
 
-use flyrig_types::lock;
-
 use anyhow::{Context as _, Result};
 use flyrig_access::{Bounds, Connection, Listener, Serve};
+use flyrig_types::lock;
 use hyper::{
     Method, Request, Response, StatusCode,
     body::Incoming,
@@ -21,7 +20,7 @@ use hyper::{
 use hyper_util::rt::{TokioIo, TokioTimer};
 use tokio::{net::TcpStream, time::timeout};
 
-/// Time limit of the headers of a request.
+/// Time within which a client must send its request.
 const PATIENCE: Duration = Duration::from_secs(1);
 /// Time limit from the connection to the end of the answer.
 const LONGEST: Duration = Duration::from_secs(2);
@@ -65,7 +64,7 @@ impl PageServer {
         Ok(Self { page, listener })
     }
 
-    /// Returns the address that is listened on.
+    /// Returns the address on which the server listens.
     pub fn address(&self) -> SocketAddr {
         self.listener.address()
     }
@@ -74,8 +73,6 @@ impl PageServer {
     pub fn publish(&self, text: String) {
         *lock(&self.page.text) = text;
     }
-}
-
 }
 
 /// Answers one request.

@@ -1,4 +1,4 @@
-//! Health of a rig for the terminal.
+//! Table of a rig's health for the terminal.
 
 use std::fmt::Write as _;
 
@@ -24,16 +24,16 @@ pub fn thread_restarts(health: &Health) -> Vec<(String, u64)> {
     health.cameras.iter().flat_map(of).chain(others).collect()
 }
 
-/// Silence of a camera from which it is reported, seconds.
+/// Least silence of a camera that is reported, seconds.
 const SILENT_FROM_S: f64 = 5.0;
 
-/// Returns for how long an open camera gave no frame, seconds; `None` while that is not worth a word.
+/// Returns the time since the last frame of an open camera, seconds; `None` while it is too short to report.
 pub fn silence_s(camera: &CameraHealth) -> Option<f64> {
     let is_open = camera.stats.running && camera.stats.opened;
     camera.quiet_s.filter(|quiet| is_open && *quiet >= SILENT_FROM_S.max(5e-3 * camera.interval_ms))
 }
 
-/// Says how much of the work is done to keep to a budget.
+/// Formats the level of effort with which a budget is kept.
 pub fn effort(budget: BudgetStats) -> String {
     format!("effort {} of {}", budget.levels.saturating_sub(budget.level), budget.levels)
 }

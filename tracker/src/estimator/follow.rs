@@ -62,8 +62,8 @@ impl PoseEstimator {
         // How far somebody has moved who was seen once, nobody can predict.
         let (look_after_m, most) = match (self.looks_at_all || track.velocity.is_none(), self.config.looks) {
             (true, _) => (0.0, usize::MAX),
-            (false, 0) => (self.config.look_after_m, usize::MAX),
-            (false, most) => (self.config.look_after_m, most),
+            (false, 0) => (self.config.settings.look_after_m, usize::MAX),
+            (false, most) => (self.config.settings.look_after_m, most),
         };
         let has_image = |slot: usize| pictures.get(slot).is_some_and(Option::is_some);
         due(&track.looks, has_image, marks, set.master_nanos, look_after_m, most)

@@ -68,15 +68,16 @@ impl PoseEstimator {
 
     /// Fits the shape to a person seen in a few sets: bone lengths to the landmarks, then lengths, girths and build to landmarks
     /// and outlines, together with the poses ([`crate::PoseConfig::shape_rounds`]). Before a single camera, which measures nothing
-    /// else, the height is the configuration's, that of somebody who stands on the floor ([`crate::PoseConfig::floor_m`]), or an average one. Goes on with the shape as it is; returns the template of
+    /// else, the height is the configuration's, that of somebody who stands on the floor ([`crate::PoseSettings::floor_m`]), or an average one. Goes on with the shape as it is; returns the template of
     /// the fitted shape for [`Self::take_shape`].
     ///
     /// # Errors
     /// Kind `Lost` when too few of the sets show a person in two views.
     pub fn measure_shape(&self, sightings: &[ShapeSighting]) -> Result<(Template, ShapeFit), TrackError> {
         if let [camera] = self.rig.cameras.as_slice() {
-            let standing = || Some((self.height_on_floor(camera, sightings)?, HeightFrom::Floor(self.config.floor_m)));
-            let configured = self.config.height_m.map(|height| (height, HeightFrom::Configuration));
+            let standing =
+                || Some((self.height_on_floor(camera, sightings)?, HeightFrom::Floor(self.config.settings.floor_m)));
+            let configured = self.config.settings.height_m.map(|height| (height, HeightFrom::Configuration));
             let (height, from) =
                 configured.or_else(standing).map_or((None, HeightFrom::Average), |(height, from)| (Some(height), from));
             return template_of_height(&self.base, height, from);
@@ -122,7 +123,7 @@ impl PoseEstimator {
     fn height_on_floor(&self, camera: &Camera, sightings: &[ShapeSighting]) -> Option<f64> {
         let body = |sighting: &ShapeSighting| skin_mesh(&self.surface, &self.model.to_pose(&sighting.fitted.turns)).0;
         let bodies: Vec<Vec<Vec3>> = sightings.iter().map(body).collect();
-        let growth = growth_to_floor(camera, self.rig.world_up, self.config.floor_m, &bodies)?;
+        let growth = growth_to_floor(camera, self.rig.world_up, self.config.settings.floor_m, &bodies)?;
         Some(growth * height_m(&self.template)).filter(|height| HEIGHTS_M.contains(height))
     }
 

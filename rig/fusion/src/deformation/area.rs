@@ -1,45 +1,45 @@
-//! Which part of an image the person can be in, and how fine it is worth looking at.
+//! Part of an image in which the person can be, and the resolution that is informative there.
 
 use flyrig_body::{DeformationGraph, Skeleton, SkinWeights, SurfaceGaussians, skin_point_f64};
 use flyrig_renderer::WantedImage;
 use flyrig_types::{Camera, Pose};
 use glam::{DMat4, DVec3};
 
-use super::TrackedView;
+use super::scene::TrackedView;
 
-/// The area ends at multiples of this: the sides of the rasteriser's tiles divide it at every level.
+/// Grid of the area's borders, pixels: the sides of the rasteriser's tiles divide it at every level.
 const GRID_PX: u32 = 16 << WantedImage::MAX_LEVEL;
-/// What the area reaches beyond mask and body, as a share of its longer side.
+/// Margin of the area around mask and body, as a share of its longer side.
 const MARGIN: f64 = 0.06;
 
-/// Pixels a square metre at which the weights of Eq. 3 mean what they mean in the paper: a person 400 pixels high.
+/// Pixels per square metre for which the paper states the weights of Eq. 3: a person 400 pixels high.
 const PAPER_PIXELS_A_M2: f64 = (400.0 / 1.75) * (400.0 / 1.75);
 
-/// How a view is looked at.
+/// Resolution and area at which a view is compared.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct ViewPlan {
-    /// Images are halved so often.
+    /// Number of times that the image is halved.
     pub level: u32,
-    /// Pixels of the halved image that count.
+    /// Pixels of the halved image that count: left, top, right, bottom.
     pub area: [u32; 4],
-    /// Factor of the loss: a square metre counts the same at any resolution.
+    /// Factor of the loss, so that a square metre counts equally at any resolution.
     pub weight: f64,
 }
 
-/// Points all over the body.
+/// Canonical points all over the body, metres, with their skinning weights.
 #[derive(Debug)]
 pub struct Landmarks {
     points: Vec<(DVec3, SkinWeights)>,
 }
 
 impl Landmarks {
-    /// The nodes of the graph.
+    /// Takes the Gaussians at the nodes of the graph.
     pub fn new(surface: &SurfaceGaussians, graph: &DeformationGraph) -> Self {
         let point = |&g: &u32| Some((surface.positions.get(g as usize)?.as_dvec3(), *surface.skin.get(g as usize)?));
         Self { points: graph.node_gaussian.iter().filter_map(point).collect() }
     }
 
-    /// Middle of the body, world metres.
+    /// Returns the middle of the body, world metres.
     pub fn center(&self, skeleton: &Skeleton, pose: &Pose) -> DVec3 {
         self.posed_center(&skeleton.world_from_canonical(pose))
     }
@@ -49,7 +49,7 @@ impl Landmarks {
             / self.points.len().max(1) as f64
     }
 
-    /// One plan a view. Pixels need not be finer than the Gaussians' spacing.
+    /// Returns one plan per view. Pixels need not be finer than the Gaussians' spacing.
     pub fn plans(
         &self,
         skeleton: &Skeleton,
@@ -77,8 +77,8 @@ impl Landmarks {
         views.iter().map(plan).collect()
     }
 
-    /// The pixels that mask or posed body may touch, `[left, top, right, bottom]`, right and bottom excluded; the whole
-    /// image when a part of the body has no place in it.
+    /// Returns the pixels that mask or posed body may touch, `[left, top, right, bottom]`, right and bottom excluded; the whole image
+    /// when a point of the body cannot be projected.
     fn area(&self, bones: &[DMat4], camera: &Camera, [width, height]: [u32; 2], rgba: &[u8]) -> [u32; 4] {
         let mut low = [f64::INFINITY; 2];
         let mut high = [f64::NEG_INFINITY; 2];

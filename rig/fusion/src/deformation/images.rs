@@ -1,4 +1,4 @@
-//! The images of one instant as the solver's data term.
+//! Images of one frame set as the solver's data term.
 
 use std::time::{Duration, Instant};
 
@@ -11,23 +11,28 @@ use flyrig_renderer::{
 use flyrig_tracker::{DataTerm, PointDerivatives};
 use flyrig_types::Camera;
 
-use super::area::ViewPlan;
-use super::{Instants, TrackedView};
-use crate::FusionError;
+use super::{
+    area::ViewPlan,
+    scene::{TrackedPerson, TrackedView, ViewAgreement},
+};
+use crate::error::FusionError;
 
 type Result<T, E = FusionError> = std::result::Result<T, E>;
 
-/// λ_mask of Eq. 3, over the sum of squared differences of all pixels.
+/// λ_mask of Eq. 3, for the sum of squared differences over all pixels.
 const MASK_WEIGHT: f32 = 2.0;
-/// Where the best view agrees at least so well, one that agrees less than the other is not believed.
+/// Agreement of the best view from which others can be distrusted.
 const AGREES: f64 = 0.6;
+/// Agreement up to which a view is then distrusted.
 const DISAGREES: f64 = 0.25;
 
-/// Everything that belongs to one view. Each has a rasteriser of its own: the derivatives walk the lists of the drawing
-/// again, so that no view is drawn twice.
+/// Buffers of one view. Each view has its own rasteriser, since the derivatives walk the tile lists of the rendering again: no view is
+/// rendered twice.
 #[derive(Debug)]
 pub struct ViewBuffers {
+    /// Width and height of the image, pixels.
     source: [u32; 2],
+    /// Number of halvings.
     level: u32,
     rasterizer: Rasterizer,
     target: RenderTarget,
@@ -36,6 +41,7 @@ pub struct ViewBuffers {
 }
 
 impl ViewBuffers {
+    /// Creates the buffers for images of size `source` that are halved `level` times.
     pub fn new(gpu: &GpuContext, gaussians: usize, source: [u32; 2], level: u32) -> Result<Self> {
         let wanted = WantedImage::zeroed(gpu, source, level)?;
         let [width, height] = wanted.size();
@@ -49,13 +55,14 @@ impl ViewBuffers {
         })
     }
 
+    /// Returns whether the buffers are for images of this size, halved as often.
     pub fn fits(&self, source: [u32; 2], level: u32) -> bool {
         (self.source, self.level) == (source, level)
     }
 }
 
-/// What the deformation lends: kernels and buffers that belong to no view.
-pub struct Kernels<'a> {
+/// Kernels and buffers of the deformation that belong to no single view.
+pub struct DeformKernels<'a> {
     pub skinner: &'a GpuSkinner,
     pub posed: &'a [GaussianBuffers],
     pub loss: &'a ImageLoss,
@@ -64,35 +71,36 @@ pub struct Kernels<'a> {
     pub gradients: &'a [GaussianGradients],
 }
 
-/// Draws and compares.
+/// Renders the person into all views and compares it with their images.
 pub struct Images<'a> {
-    scene: Instants<'a>,
+    person: TrackedPerson<'a>,
     views: &'a [TrackedView<'a>],
-    /// The views' cameras at the size that is compared.
+    /// Camera of each view at the size that is compared.
     cameras: Vec<Camera>,
     buffers: &'a mut [ViewBuffers],
     settings: Vec<LossSettings>,
-    kernels: Kernels<'a>,
-    /// Views that count.
+    kernels: DeformKernels<'a>,
+    /// Whether each view counts.
     trusted: Vec<bool>,
-    /// Sums of what is drawn now, and of what the last derivatives were made of.
+    /// Sums of the current rendering, one element per view.
     sums: Vec<ImageSums>,
+    /// Sums of the rendering from which the last derivatives were computed.
     derived_sums: Vec<ImageSums>,
-    /// What is drawn now, and its loss.
-    drawn: Option<(Vec<[f32; 4]>, f64)>,
+    /// Displacement that is rendered now, and its loss.
+    rendered: Option<(Vec<[f32; 4]>, f64)>,
     draw_time: Duration,
     derivatives_time: Duration,
 }
 
 impl<'a> Images<'a> {
-    /// Prepares the images at the size that is compared.
+    /// Prepares the images at the size that is compared. `color_weight` is λ_color of Eq. 3.
     pub fn new(
-        scene: Instants<'a>,
+        person: TrackedPerson<'a>,
         views: &'a [TrackedView<'a>],
         plans: &[ViewPlan],
         buffers: &'a mut [ViewBuffers],
-        kernels: Kernels<'a>,
-        // Of the colours, 0 before there are any: then only the masks can tell anything.
+        kernels: DeformKernels<'a>,
+        // 0 before there are colours: then only the masks are informative.
         color_weight: f32,
     ) -> Self {
         let settings: Vec<LossSettings> = views
@@ -105,15 +113,15 @@ impl<'a> Images<'a> {
                 with_unknown: view.with_unknown,
             })
             .collect();
-        let mut encoder = scene.gpu.device.create_command_encoder(&Default::default());
+        let mut encoder = person.gpu.device.create_command_encoder(&Default::default());
         for ((view, buffers), settings) in views.iter().zip(&*buffers).zip(&settings) {
-            kernels.loss.prepare(scene.gpu, &mut encoder, &buffers.wanted, view.words, settings);
+            kernels.loss.prepare(person.gpu, &mut encoder, &buffers.wanted, view.words, settings);
         }
-        scene.gpu.queue.submit([encoder.finish()]);
+        person.gpu.queue.submit([encoder.finish()]);
         let cameras = views.iter().zip(plans).map(|(view, plan)| view.camera.halved(plan.level)).collect();
         let (draw_time, derivatives_time) = Default::default();
         Self {
-            scene,
+            person,
             views,
             cameras,
             buffers,
@@ -122,53 +130,55 @@ impl<'a> Images<'a> {
             trusted: vec![true; views.len()],
             sums: Vec::new(),
             derived_sums: Vec::new(),
-            drawn: None,
+            rendered: None,
             draw_time,
             derivatives_time,
         }
     }
 
-    /// Time spent on drawing and on derivatives.
+    /// Returns the time spent on rendering and on derivatives.
     pub fn times(&self) -> (Duration, Duration) {
         (self.draw_time, self.derivatives_time)
     }
 
-    /// Leaves out what disagrees with all others: a camera that is covered, or whose mask shows something else.
+    /// Leaves out views that disagree with all others: a camera that is covered, or whose mask shows something else.
     pub fn distrust(&mut self, displacement: &[[f32; 4]]) -> Result<()> {
-        self.draw(displacement)?;
+        self.render(displacement)?;
         let best = self.sums.iter().map(agreement).fold(0.0, f64::max);
         if best > AGREES {
             self.trusted = self.sums.iter().map(|sums| agreement(sums) > DISAGREES).collect();
         }
         let loss = self.trusted_loss();
-        if let Some((.., drawn_loss)) = &mut self.drawn {
-            *drawn_loss = loss;
+        if let Some((.., rendered_loss)) = &mut self.rendered {
+            *rendered_loss = loss;
         }
         Ok(())
     }
 
-    /// By view how much agrees in this state, which must have been drawn or derived last, and whether it counted.
-    pub fn judged(&self, displacement: &[[f32; 4]]) -> Vec<(f64, bool)> {
-        let is_drawn = self.drawn.as_ref().is_some_and(|(d, _)| d == displacement);
-        let sums = if is_drawn || self.derived_sums.is_empty() { &self.sums } else { &self.derived_sums };
-        sums.iter().map(agreement).zip(self.trusted.iter().copied()).collect()
+    /// Returns the agreement of each view with this displacement, for which loss or derivatives must have been computed last.
+    pub fn agreement(&self, displacement: &[[f32; 4]]) -> Vec<ViewAgreement> {
+        let is_rendered = self.rendered.as_ref().is_some_and(|(d, _)| d == displacement);
+        let sums = if is_rendered || self.derived_sums.is_empty() { &self.sums } else { &self.derived_sums };
+        let view = |(sums, &is_trusted)| ViewAgreement { fraction: agreement(sums), is_trusted };
+        sums.iter().zip(&self.trusted).map(view).collect()
     }
 
+    /// Sums the loss of the views that count.
     fn trusted_loss(&self) -> f64 {
         self.sums.iter().zip(&self.trusted).filter(|(_, trusted)| **trusted).map(|(sums, _)| sums.loss).sum()
     }
 
-    /// Draws all views, unless that is what is drawn already, and returns the loss.
-    fn draw(&mut self, displacement: &[[f32; 4]]) -> Result<f64> {
-        if let Some((moved, loss)) = &self.drawn
+    /// Renders all views, unless this displacement is rendered already, and returns the loss.
+    fn render(&mut self, displacement: &[[f32; 4]]) -> Result<f64> {
+        if let Some((moved, loss)) = &self.rendered
             && moved == displacement
         {
             return Ok(*loss);
         }
         let start = Instant::now();
-        self.drawn = None;
-        let Instants { gpu, skeleton, poses: instants, .. } = &self.scene;
-        let Kernels { skinner, posed, loss, .. } = &self.kernels;
+        self.rendered = None;
+        let TrackedPerson { gpu, skeleton, poses: instants, .. } = &self.person;
+        let DeformKernels { skinner, posed, loss, .. } = &self.kernels;
         self.kernels.displacement.write(gpu, displacement);
         let mut encoder = gpu.device.create_command_encoder(&Default::default());
         for (pose, gaussians) in instants.iter().zip(*posed) {
@@ -181,7 +191,7 @@ impl<'a> Images<'a> {
             let raster = RasterSettings {
                 outputs: Outputs::COLOR,
                 area: Some(settings.area),
-                // As wide as in the whole image: a wider filter draws a wider person, and the solver makes it thinner.
+                // As wide as in the whole image: a wider filter renders a wider person, and the solver makes it thinner.
                 filter_variance_px2: plain.filter_variance_px2 * 0.25f32.powi(self.buffers[i].level as i32),
                 ..plain
             };
@@ -192,7 +202,7 @@ impl<'a> Images<'a> {
         gpu.queue.submit([encoder.finish()]);
         self.sums = loss.read(gpu, self.views.len())?;
         let loss = self.trusted_loss();
-        self.drawn = Some((displacement.to_vec(), loss));
+        self.rendered = Some((displacement.to_vec(), loss));
         self.draw_time += start.elapsed();
         Ok(loss)
     }
@@ -202,21 +212,21 @@ impl DataTerm for Images<'_> {
     type Error = FusionError;
 
     fn loss(&mut self, displacement: &[[f32; 4]]) -> Result<f64> {
-        self.draw(displacement)
+        self.render(displacement)
     }
 
     fn derivatives(&mut self, displacement: &[[f32; 4]], out: &mut Vec<PointDerivatives>) -> Result<f64> {
-        let loss = self.draw(displacement)?;
+        let loss = self.render(displacement)?;
         self.derived_sums.clone_from(&self.sums);
         let start = Instant::now();
-        let Instants { gpu, skeleton, poses: instants, .. } = &self.scene;
+        let TrackedPerson { gpu, skeleton, poses: instants, .. } = &self.person;
         let mut encoder = gpu.device.create_command_encoder(&Default::default());
         for gradients in self.kernels.gradients.iter().take(instants.len()) {
             gradients.clear(&mut encoder);
         }
         let trusted = self.views.iter().zip(&*self.buffers).zip(&self.trusted).filter(|(_, trusted)| **trusted);
         for ((view, buffers), _) in trusted {
-            let Kernels { posed, gradients, .. } = self.kernels;
+            let DeformKernels { posed, gradients, .. } = self.kernels;
             let Some((gaussians, sums)) = posed.get(view.instant).zip(gradients.get(view.instant)) else { continue };
             let ViewBuffers { rasterizer, target, incoming, .. } = buffers;
             let what = (incoming, Carry::Lift);
@@ -236,7 +246,7 @@ impl DataTerm for Images<'_> {
     }
 }
 
-/// Share of the person that is where the image shows it, less what is drawn elsewhere, 0..=1.
+/// Returns the fraction of the person that is where the image shows it, less what is rendered elsewhere, 0..=1.
 fn agreement(sums: &ImageSums) -> f64 {
     if sums.wanted > 0.0 && sums.mask.is_finite() { (1.0 - sums.mask / sums.wanted).max(0.0) } else { 0.0 }
 }

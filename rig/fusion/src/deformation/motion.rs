@@ -1,10 +1,10 @@
-//! From the nodes to all Gaussians, and to the template's vertices.
+//! Motion of all Gaussians and of the template's vertices with the nodes of the deformation graph.
 
 use flyrig_body::{DeformationGraph, SurfaceGaussians, Template, VertexMeans, displacement};
 use glam::{DVec3, Vec3};
 use rayon::prelude::*;
 
-/// Eq. 2 for every Gaussian, whether the solver looks at it or not.
+/// Displacement of every Gaussian by FlyHuman, Eq. 2, whether the solver compares it or not.
 #[derive(Debug)]
 pub struct MeshMotion {
     rest: Vec<Vec3>,
@@ -28,7 +28,7 @@ impl MeshMotion {
         }
     }
 
-    /// Follows the nodes; canonical displacements t_x, metres, and growth, as [`displacement`] has them.
+    /// Computes the Gaussians' canonical displacements t_x, metres, and their growth from the nodes' translations; see [`displacement`].
     pub fn follow(&mut self, translations: &[DVec3]) -> &[[f32; 4]] {
         let rest = &self.rest;
         let one = |((out, nodes), weights): ((&mut [f32; 4], &[u32; 4]), &[f32; 4])| {
@@ -38,7 +38,7 @@ impl MeshMotion {
         &self.displacement
     }
 
-    /// Displacement of every vertex of the template.
+    /// Returns the canonical displacement of every vertex of the template, metres.
     pub fn of_vertices(&self) -> Vec<Vec3> {
         self.vertices.of(&self.displacement)
     }

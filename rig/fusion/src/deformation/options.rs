@@ -1,35 +1,35 @@
-//! How the deformation is tracked.
+//! Options of the deformation: solver, resolution and number of Gaussians.
 
 use flyrig_body::Part;
 use flyrig_renderer::WantedImage;
 use flyrig_tracker::DeformSettings;
 
-/// So many are compared even where the person is a few pixels high.
+/// Fewest Gaussians that are compared, even where the person is a few pixels high.
 const LEAST_GAUSSIANS: f64 = 2000.0;
 /// λ_color of the paper's Eq. 3.
 pub const PAPER_COLOR_WEIGHT: f32 = 2.0;
 
-/// Everything about the deformation that may be chosen.
+/// Options of the deformation.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct DeformOptions {
     /// Steps, weights and limits.
     pub solver: DeformSettings,
-    /// Gaussians that are compared with the images; the others follow.
+    /// Number of Gaussians that are compared with the images; the others follow.
     pub gaussians: usize,
-    /// Gaussians that are compared at most for every pixel that the person's whole surface would take in the finest view.
+    /// Largest number of compared Gaussians per pixel that the person's whole surface would take in the finest view.
     pub gaussians_a_pixel: f64,
-    /// λ_color of Eq. 3, over the sum of squared differences (linear light, 0..=1) of all pixels.
+    /// λ_color of Eq. 3, for the sum of squared differences (linear light, 0..=1) over all pixels.
     pub color_weight: f32,
-    /// Images are halved at most so often, while a pixel stays finer than the compared Gaussians' spacing.
+    /// Largest number of times that an image is halved, while a pixel stays finer than the compared Gaussians' spacing.
     pub max_level: u32,
-    /// Views that are compared at most, those from the most different directions; 0: all.
+    /// Largest number of compared views, those from the most different directions; 0: all.
     pub views: usize,
     /// Whether head, hands and feet are stiffer than the rest.
     pub stiff_parts: bool,
 }
 
 impl DeformOptions {
-    /// Compared as they are drawn: every Gaussian, every pixel.
+    /// Compares every Gaussian with every pixel, as in the paper.
     pub fn full(solver: DeformSettings) -> Self {
         Self {
             gaussians: usize::MAX,
@@ -42,14 +42,14 @@ impl DeformOptions {
         }
     }
 
-    /// Everything is compared, however little more it tells.
+    /// Compares all chosen Gaussians at full resolution, however little that adds.
     #[must_use]
     pub fn without_level_of_detail(self) -> Self {
         Self { gaussians_a_pixel: f64::INFINITY, max_level: 0, ..self }
     }
 
-    /// How many times stiffer than clothes a part is. Three outlines leave a skull or a heel much freedom: where they err,
-    /// it grew horns.
+    /// Returns how many times stiffer than clothes a part is. Three outlines leave a skull or a heel much freedom: where they err, it
+    /// grew horns.
     pub fn stiffness(&self, part: Part) -> f64 {
         match part {
             Part::Head if self.stiff_parts => 30.0,
@@ -58,13 +58,14 @@ impl DeformOptions {
         }
     }
 
-    /// How many of a surface's Gaussians are compared, where a pixel of the finest view covers `pixel_m` of the person.
+    /// Returns the number of compared Gaussians of a surface of `area_m2`, where a pixel of the finest view covers `pixel_m` metres of the
+    /// person.
     pub fn compared(&self, area_m2: f64, pixel_m: f64) -> usize {
         let useful = (self.gaussians_a_pixel * area_m2 / (pixel_m * pixel_m)).max(LEAST_GAUSSIANS);
         if useful < self.gaussians as f64 { useful as usize } else { self.gaussians }
     }
 
-    /// Compared no finer than the result needs: measured in docs/benchmarks/deform.md.
+    /// Compares no finer than the result needs (measured in docs/benchmarks/deform.md).
     pub fn coarse(solver: DeformSettings) -> Self {
         Self {
             solver,

@@ -1,4 +1,4 @@
-//! The chain from images to displaced Gaussians on hard scenes, twice over, and beside an f64 reference.
+//! Deformation from images to displaced Gaussians on hard scenes: repeated runs, and a comparison with an f64 reference.
 
 mod chain;
 mod hard;
@@ -18,16 +18,16 @@ use flyrig_types::{Frame, FrameSet, Image, Mask, PersonId, PixelFormat, PoseTrac
 use glam::DVec3;
 
 use self::chain::Chain;
-use self::small_scene::{Device, Shot, SmallScene};
+use self::small_scene::{SceneShot, SmallScene, TestedDeformation};
 use super::*;
 use crate::{BodySettings, GivenPerception, SessionBuilder, SessionSettings, TrackingSettings};
 
-/// Most that a Gaussian may stand from where f64 puts it: eight times what rounding was measured to do, and twenty units in
-/// the last place of a coordinate of 2 m. Once in fifty frames it may be more, until that has faded: a body at rest keeps it.
+/// Largest distance of a Gaussian from its f64 position, metres: eight times the measured effect of rounding, and twenty units in the last
+/// place of a coordinate of 2 m. Once in fifty frames it may be larger, until that has faded: a body at rest keeps it.
 const MOST_APART_M: f64 = 5e-6;
-/// Then, where a pixel or a Gaussian lies so near to a limit (alpha 1/255, back-facing, order by depth) that rounding
-/// decides; and always from where it would stand were every step solved exactly, for conjugate gradients end at a
-/// thousandth of the residual of steps of up to 2 cm. One step that only f64 accepts puts millimetres between them.
+/// Largest distance in such a frame, where a pixel or a Gaussian lies so near to a limit (alpha 1/255, back-facing, order by depth) that
+/// rounding decides. Also the largest distance from an exact solve of every step: conjugate gradients end at a thousandth of the residual of
+/// steps of up to 2 cm. One step that only f64 accepts puts millimetres between them.
 const MOST_AT_A_JUMP_M: f64 = 2e-4;
 
 fn gpu() -> &'static GpuContext {
@@ -48,14 +48,14 @@ struct Apart {
     mean: f64,
 }
 
-/// After a frame: the device from the reference, from the reference with an exact solve, and from where the clothes are;
-/// and the last without any displacement.
+/// Distances after a frame: of the device from the reference, from the reference with an exact solve, and from the true clothes; and of the
+/// undeformed body from the true clothes.
 struct Row {
     same: Apart,
     exact: Apart,
     truth: Apart,
     skinned: Apart,
-    /// Steps that were taken.
+    /// Number of accepted steps.
     steps: usize,
 }
 
@@ -65,11 +65,11 @@ fn apart(ours: &[[f32; 4]], reference: &[DVec3]) -> Apart {
     Apart { max: all.iter().copied().fold(0.0, f64::max), mean: all.iter().sum::<f64>() / all.len() as f64 }
 }
 
-/// The default solver over a moving scene of 80 Gaussians on 10 nodes, three images of 48x48 compared at 24x24.
+/// Runs the default solver over a moving scene of 80 Gaussians on 10 nodes, with three images of 48x48 compared at 24x24.
 fn diverge(frames: usize) -> Vec<Row> {
     let scene = SmallScene::new(80, 10, 48);
     let settings = DeformSettings::default();
-    let mut device = Device::new(gpu(), &scene, options());
+    let mut device = TestedDeformation::new(gpu(), &scene, options());
     let mut same = Chain::new(&scene, settings, 1, 1e-3);
     let mut exact = Chain::new(&scene, settings, 1, 1e-12);
     let rest = scene.surface.inset();
@@ -77,7 +77,7 @@ fn diverge(frames: usize) -> Vec<Row> {
         let shot = scene.shot(frame as f64);
         let report = device.track(&scene, &shot).unwrap();
         assert!(
-            device.deformation.judged().iter().all(|judged| judged.is_some_and(|(_, trusted)| trusted)),
+            device.deformation.agreement().iter().all(|view| view.is_some_and(|view| view.is_trusted)),
             "every view counts"
         );
         let losses = same.track(&shot);
@@ -106,7 +106,7 @@ fn worst(rows: &[Row], of: impl Fn(&Row) -> f64) -> f64 {
     rows.iter().map(of).fold(0.0, f64::max)
 }
 
-/// Prints the distances, and holds them to their bounds.
+/// Prints the distances and checks them against their bounds.
 fn check(rows: &[Row]) {
     let mean = |of: fn(&Row) -> Apart| rows.iter().map(|row| of(row).mean).sum::<f64>() / rows.len() as f64;
     let (same, exact) = (worst(rows, |row| row.same.max), worst(rows, |row| row.exact.max));
@@ -160,9 +160,9 @@ fn the_chain_in_f32_stays_with_the_chain_in_f64_for_200_frames() {
 #[test]
 fn the_whole_solve_gives_the_same_bytes_again() {
     let scene = SmallScene::new(80, 10, 48);
-    let shots: Vec<Shot> = (0..12).map(|frame| scene.shot(f64::from(frame))).collect();
+    let shots: Vec<SceneShot> = (0..12).map(|frame| scene.shot(f64::from(frame))).collect();
     let run = |gpu: &GpuContext| {
-        let mut device = Device::new(gpu, &scene, options());
+        let mut device = TestedDeformation::new(gpu, &scene, options());
         let reports: Vec<_> = shots.iter().map(|shot| device.track(&scene, shot)).collect();
         assert!(reports.iter().flatten().map(|report| report.accepted).sum::<usize>() > 12, "{reports:?}");
         (reports, device.centers(&scene, &shots[0].poses[0]))

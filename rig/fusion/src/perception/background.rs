@@ -1,11 +1,13 @@
-//! Backgrounds of a rig's cameras: from plates or a key colour, kept up to date, with warnings that name the camera.
+//! Backgrounds of a rig's cameras, from plates or a key colour: creation, schedule of updates, and warnings that name the camera.
+//!
+//! A background is updated with every fourth frame set, and with every one while it is being learnt.
 
 use flyrig_tracker::{Background, BackgroundEvent};
 use flyrig_types::{Camera, Image};
 
-use crate::{FusionError, PerceptionSettings};
+use crate::{error::FusionError, settings::perception::PerceptionSettings};
 
-/// Backgrounds take in one of so many sets.
+/// Frame sets from one update of the backgrounds to the next.
 const UPDATE_EVERY: u32 = 4;
 
 /// Returns the background of each camera, where the settings or a plate give one. A key colour replaces the plates.
@@ -24,14 +26,14 @@ pub(super) fn backgrounds(
     cameras.iter().enumerate().map(of).collect()
 }
 
-/// Counts sets between updates of the backgrounds.
+/// Count of frame sets between updates of the backgrounds.
 #[derive(Debug, Default)]
 pub(super) struct BackgroundWatch {
     sets: u32,
 }
 
 impl BackgroundWatch {
-    /// Counts a set; true when the backgrounds take it in. Those that are being learnt take in every set.
+    /// Counts a frame set, and returns whether the backgrounds are updated with it. Backgrounds that are being learnt use every frame set.
     pub fn is_due(&mut self, are_learning: bool) -> bool {
         self.sets = self.sets.wrapping_add(1);
         self.sets % UPDATE_EVERY == 1 || are_learning

@@ -1,51 +1,80 @@
-//! People whose poses are known: a simulator's, a recorded motion's.
+//! People whose poses are known, from a simulator or a recorded motion.
 
 use flyrig_body::{Template, skin_mesh};
-use flyrig_tracker::{Background, BodyGate, Matte, PersonArea, matte};
+use flyrig_tracker::{Background, BodyGate, EdgeColor, Matte, PersonArea, matte};
 use flyrig_types::{Camera, Frame, FrameSet, Image, Mask, PersonId, Pose, PoseTrack, Rig};
 use glam::Vec3;
 
-use super::background::{BackgroundWatch, backgrounds, report};
-use super::outfits::OutfitSearch;
-use super::split_mask::{PosedMesh, split_mask};
-use super::{KnownPerson, Observation, Perception, SeenPerson, ViewObservation};
-use crate::{FusionError, Origin, PerceptionSettings, StageTimes};
+use super::{
+    background::{BackgroundWatch, backgrounds, report},
+    observation::{KnownPerson, Perception, PersonObservation, SeenPerson, ViewObservation},
+    outfit_search::OutfitSearch,
+    split_mask::{PosedMesh, split_mask},
+};
+use crate::{
+    error::FusionError,
+    health::stage_times::StageTimes,
+    settings::perception::{Origin, PerceptionSettings},
+};
 
-/// One person with a known motion.
+/// Mask of all people in one frame, and the foreground colours along its outline.
+type EdgedMask = (Option<Mask>, Vec<EdgeColor>);
+
+/// Person with a known motion.
 #[derive(Debug, Clone)]
 pub struct GivenPerson {
-    /// Who.
+    /// Id of the person.
     pub person: PersonId,
-    /// Shape, skin and skeleton.
+    /// Shape, skin and skeleton of the person.
     pub template: Template,
     /// Poses over time.
     pub track: PoseTrack,
-    /// Whether the motion starts again at its end.
+    /// Whether the motion repeats.
     pub repeat: bool,
 }
 
 impl GivenPerson {
+    /// Returns the pose at a time, nanoseconds.
     fn at(&self, nanos: i64) -> Pose {
         if self.repeat { self.track.at_repeated(nanos) } else { self.track.at(nanos) }
     }
 }
 
-/// Poses from tracks; masks from the frames, or from the difference to the empty scene near the posed bodies.
+/// Perception with poses from tracks, and masks from the frames or from the difference to the empty scene near the posed bodies.
+///
+/// # Example
+/// ```
+/// use flyrig_fusion::{
+///     FrameSet, GivenPerception, Perception as _, PersonObservation, StageTimes,
+///     body::{ShapeParams, default_template},
+///     types::{PoseTrack, Rig},
+/// };
+///
+/// let rig = Rig { cameras: Vec::new(), world_up: glam::DVec3::Y };
+/// let body = default_template(&ShapeParams::default())?;
+/// let track = PoseTrack::new(vec![(0, body.skeleton.rest_pose())])?;
+/// let mut perception = GivenPerception::repeating(&rig, body, track);
+///
+/// let set = FrameSet { index: 0, master_nanos: 0, frames: Vec::new() };
+/// let observed = perception.observe(&set, &mut StageTimes::default())?;
+/// assert!(matches!(observed.as_slice(), [PersonObservation::Seen(_)]));
+/// # Ok::<(), Box<dyn std::error::Error>>(())
+/// ```
 #[derive(Debug)]
 pub struct GivenPerception {
     people: Vec<GivenPerson>,
     cameras: Vec<Camera>,
     masks: Origin,
-    /// By slot.
+    /// Background of each camera, one element per slot.
     backgrounds: Vec<Option<Background>>,
-    /// By person.
+    /// Search for clothes, one element per person.
     outfits: Vec<OutfitSearch>,
     watch: BackgroundWatch,
 }
 
 impl GivenPerception {
-    /// Observes these people with the cameras of `rig`, taking the masks from the frames. A frame's mask covers everybody: it
-    /// is divided among several people by their posed bodies.
+    /// Observes these people with the cameras of `rig`, with the masks of the frames. A frame's mask covers all people, and is divided
+    /// among several by their posed bodies.
     #[must_use]
     pub fn new(rig: &Rig, people: Vec<GivenPerson>) -> Self {
         let backgrounds = vec![None; rig.cameras.len()];
@@ -59,20 +88,20 @@ impl GivenPerception {
         }
     }
 
-    /// Observes one person who repeats a motion for ever.
+    /// Observes one person who repeats a motion forever.
     #[must_use]
     pub fn repeating(rig: &Rig, template: Template, track: PoseTrack) -> Self {
         Self::new(rig, vec![GivenPerson { person: PersonId::default(), template, track, repeat: true }])
     }
 
-    /// The people's templates are dressed already: clothes are not looked for.
+    /// Declares that the people's templates are dressed already, so that clothes are not looked for.
     #[must_use]
     pub fn dressed(self) -> Self {
         Self { outfits: vec![OutfitSearch::over(); self.people.len()], ..self }
     }
 
-    /// Makes masks from the difference to images of the empty scene, one slot a camera, or to the settings' key colour, where
-    /// the settings estimate masks.
+    /// Makes masks from the difference to images of the empty scene, one per slot, or to the settings' key colour, where the settings
+    /// estimate masks.
     ///
     /// # Errors
     /// [`FusionError::Track`] names the camera whose plate cannot be used, [`FusionError::Setting`] the key colour.
@@ -104,20 +133,9 @@ impl Perception for GivenPerception {
             .collect()
     }
 
-    fn observe(&mut self, set: &FrameSet, stages: &mut StageTimes) -> Result<Vec<Observation>, FusionError> {
+    fn observe(&mut self, set: &FrameSet, stages: &mut StageTimes) -> Result<Vec<PersonObservation>, FusionError> {
         let poses: Vec<Pose> = self.people.iter().map(|given| given.at(set.master_nanos)).collect();
-        let (mut masks, mut edge_colors) = (Vec::new(), Vec::new());
-        for (slot, frame) in set.present() {
-            let (mask, colors) = match self.masks {
-                Origin::Given => (frame.mask.clone(), Vec::new()),
-                Origin::Estimated => {
-                    let made = stages.time("mask from plate", || self.estimated_mask(slot, frame, &poses))?;
-                    made.map_or_else(Default::default, |Matte { mask, colors }| (Some(mask), colors))
-                }
-            };
-            masks.push(mask);
-            edge_colors.push(colors);
-        }
+        let (masks, edge_colors): (Vec<_>, Vec<_>) = self.masks(set, &poses, stages)?.into_iter().unzip();
         if self.masks == Origin::Estimated
             && self.watch.is_due(self.backgrounds.iter().flatten().any(Background::is_learning))
         {
@@ -138,16 +156,16 @@ impl Perception for GivenPerception {
         let seen = |((given, pose), views): ((&GivenPerson, Pose), Vec<ViewObservation>)| {
             let person = given.person;
             if pose.is_valid() {
-                Observation::Seen(SeenPerson { person, pose, confidence: 1.0, views })
+                PersonObservation::Seen(SeenPerson { person, pose, confidence: 1.0, views })
             } else {
-                Observation::Lost { person, reason: "the pose holds numbers that are not finite".to_owned() }
+                PersonObservation::Lost { person, reason: "the pose holds numbers that are not finite".to_owned() }
             }
         };
-        // Clothes that are found here are drawn from the next set on.
-        let observations: Vec<Observation> = self.people.iter().zip(poses).zip(views).map(seen).collect();
+        // Clothes that are found here are drawn from the next frame set on.
+        let observations: Vec<PersonObservation> = self.people.iter().zip(poses).zip(views).map(seen).collect();
         for ((given, search), observation) in self.people.iter().zip(&mut self.outfits).zip(&observations) {
-            if let Observation::Seen(seen) = observation {
-                search.take(set, seen, &given.template, &self.cameras);
+            if let PersonObservation::Seen(seen) = observation {
+                search.ingest(set, seen, &given.template, &self.cameras);
             }
         }
         Ok(observations)
@@ -155,16 +173,16 @@ impl Perception for GivenPerception {
 }
 
 impl GivenPerception {
-    /// Looks for clothes in a few sets ([`crate::SHAPE_SETS`], over [`crate::SHAPE_SECS`]) before the session is built, so that they are known from the
-    /// first set on. Otherwise they are found in the first seconds.
+    /// Looks for clothes in a few frame sets ([`crate::SHAPE_SETS`], over [`crate::SHAPE_SECS`]) before the session is built, so that they
+    /// are known from the first frame set on. Otherwise they are found in the first seconds.
     ///
     /// # Errors
-    /// Those of [`Perception::observe`].
+    /// As [`Perception::observe`].
     pub fn find_outfits(&mut self, sets: &[FrameSet]) -> Result<(), FusionError> {
         let mut searches = vec![OutfitSearch::default(); self.people.len()];
         for set in sets {
             for (search, observation) in searches.iter_mut().zip(self.observe(set, &mut StageTimes::default())?) {
-                if let Observation::Seen(seen) = observation {
+                if let PersonObservation::Seen(seen) = observation {
                     search.add(set, &seen);
                 }
             }
@@ -176,7 +194,22 @@ impl GivenPerception {
         Ok(())
     }
 
-    /// Vertices and triangles of everybody at the time of a frame; of those whose poses are valid.
+    /// Returns the mask of all people in each present frame, and the foreground colours along its outline.
+    fn masks(&self, set: &FrameSet, poses: &[Pose], stages: &mut StageTimes) -> Result<Vec<EdgedMask>, FusionError> {
+        let mut masks = Vec::new();
+        for (slot, frame) in set.present() {
+            masks.push(match self.masks {
+                Origin::Given => (frame.mask.clone(), Vec::new()),
+                Origin::Estimated => {
+                    let made = stages.time("mask from plate", || self.estimated_mask(slot, frame, poses))?;
+                    made.map_or_else(Default::default, |Matte { mask, colors }| (Some(mask), colors))
+                }
+            });
+        }
+        Ok(masks)
+    }
+
+    /// Returns vertices, world metres, and triangles of all people with valid poses at the time of a frame.
     fn bodies(&self, frame: &Frame, poses: &[Pose]) -> (Vec<Vec3>, Vec<[u32; 3]>) {
         let (mut vertices, mut triangles) = (Vec::new(), Vec::new());
         for ((given, search), pose) in self.people.iter().zip(&self.outfits).zip(poses) {
@@ -192,7 +225,7 @@ impl GivenPerception {
         (vertices, triangles)
     }
 
-    /// Lets the backgrounds follow the light where nobody stands.
+    /// Lets the backgrounds follow the light where no person stands.
     fn follow_backgrounds(&mut self, set: &FrameSet, poses: &[Pose]) -> Result<(), FusionError> {
         for (slot, frame) in set.present() {
             let bodies = self.bodies(frame, poses);
@@ -208,7 +241,7 @@ impl GivenPerception {
         Ok(())
     }
 
-    /// Everybody's mask in a frame, from the camera's background and the posed bodies.
+    /// Returns the mask of all people in a frame, from the camera's background and the posed bodies.
     fn estimated_mask(&self, slot: usize, frame: &Frame, poses: &[Pose]) -> Result<Option<Matte>, FusionError> {
         let Some((camera, background)) =
             self.cameras.get(slot).zip(self.backgrounds.get(slot).and_then(Option::as_ref))
@@ -223,7 +256,7 @@ impl GivenPerception {
         Ok(Some(matte(&frame.image, &mask, Some(background))?))
     }
 
-    /// Divides everybody's masks: by person, then by present frame.
+    /// Divides the masks of all people: one element per person, then per present frame.
     fn divide(
         &self,
         set: &FrameSet,

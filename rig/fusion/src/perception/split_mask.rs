@@ -1,32 +1,62 @@
-//! Divides a mask of everybody among people whose posed bodies are known.
+//! Division of a mask of all people among those whose posed bodies are known.
 
 use std::collections::VecDeque;
 
 use flyrig_types::{Camera, Mask};
 use glam::{DVec2, Vec3};
 
-/// A body where it stands, world metres.
+/// Posed body, world metres.
 pub(super) struct PosedMesh<'a> {
     pub vertices: Vec<Vec3>,
     pub triangles: &'a [[u32; 3]],
 }
 
-/// No body is at this pixel.
+/// Label of a pixel without a body.
 const NOBODY: u32 = u32::MAX;
-/// This pixel is at the border of two bodies.
+/// Label of a pixel at the border of two bodies.
 const MIXED: u32 = u32::MAX - 1;
-/// Corners nearer to the camera's plane are not drawn, metres.
+/// Least depth of a corner that is drawn, metres.
 const NEAR_M: f64 = 0.05;
-/// Clothes and hair stand off the body by so much, metres: before a body behind, nobody knows whose pixel it is.
+/// Distance by which clothes and hair stand off the body, metres. In front of a body behind, such a pixel may belong to either.
 const CLOTHES_M: f64 = 0.05;
-/// A body is behind another one from this difference of depth on, metres.
+/// Least difference of depth at which a body is behind another one, metres.
 const BEHIND_M: f64 = 0.1;
 
-/// Returns, for each body, its own part of the mask and the part that says nothing about it. A pixel belongs to the nearest
-/// body drawn there, else (clothes, hair) to the body of the closest pixel that has one. Pixels beside another body's mix
-/// both colours, and those of a body next to one in front may show that one's clothes: they are nobody's own.
+/// Returns, for each body, its own part of the mask and the part that is not informative for it. A pixel belongs to the nearest body drawn
+/// there, else (clothes, hair) to the body of the closest pixel that has one. Pixels beside those of another body mix both colours, and
+/// those of a body next to one in front may show the other's clothes: they belong to no body.
 pub(super) fn split_mask(camera: &Camera, mask: &Mask, bodies: &[PosedMesh<'_>]) -> Vec<(Mask, Mask)> {
     let (width, height) = (mask.width() as usize, mask.height() as usize);
+    let (mut labels, depths) = nearest_bodies(camera, bodies, [width, height]);
+    let hidden = behind_clothes(camera, &labels, &depths, bodies.len() as u32, [width, height]);
+    spread(&mut labels, width, height);
+    let mixed = |at: usize| {
+        let (x, y) = (at % width, at / width);
+        let near = |v: usize, side: usize| v.saturating_sub(1)..(v + 2).min(side);
+        near(y, height).any(|v| near(x, width).any(|u| labels[v * width + u] != labels[at]))
+    };
+    let labels: Vec<u32> = (0..labels.len())
+        .map(|at| {
+            if mask.coverage()[at] > 0 && labels[at] != NOBODY && (hidden[at] || mixed(at)) {
+                MIXED
+            } else {
+                labels[at]
+            }
+        })
+        .collect();
+    let part = |keep: &dyn Fn(u32) -> bool| {
+        let coverage = mask.coverage().iter().zip(&labels).map(|(&c, &label)| if keep(label) { c } else { 0 });
+        let coverage: Vec<u8> = coverage.collect();
+        // The size is the mask's own, so it is never rejected.
+        Mask::new(mask.width(), mask.height(), coverage).unwrap_or_else(|_| mask.clone())
+    };
+    (0..bodies.len() as u32)
+        .map(|own| (part(&|label| label == own), part(&|label| label != own && label != NOBODY)))
+        .collect()
+}
+
+/// Draws the bodies: label and depth in metres of the nearest one at each pixel.
+fn nearest_bodies(camera: &Camera, bodies: &[PosedMesh<'_>], [width, height]: [usize; 2]) -> (Vec<u32>, Vec<f64>) {
     let mut labels = vec![NOBODY; width * height];
     let mut depths = vec![f64::INFINITY; width * height];
     for (label, body) in (0u32..).zip(bodies) {
@@ -52,34 +82,10 @@ pub(super) fn split_mask(camera: &Camera, mask: &Mask, bodies: &[PosedMesh<'_>])
             }
         }
     }
-    let hidden = behind_clothes(camera, &labels, &depths, bodies.len() as u32, [width, height]);
-    spread(&mut labels, width, height);
-    let mixed = |at: usize| {
-        let (x, y) = (at % width, at / width);
-        let near = |v: usize, side: usize| v.saturating_sub(1)..(v + 2).min(side);
-        near(y, height).any(|v| near(x, width).any(|u| labels[v * width + u] != labels[at]))
-    };
-    let labels: Vec<u32> = (0..labels.len())
-        .map(|at| {
-            if mask.coverage()[at] > 0 && labels[at] != NOBODY && (hidden[at] || mixed(at)) {
-                MIXED
-            } else {
-                labels[at]
-            }
-        })
-        .collect();
-    let part = |keep: &dyn Fn(u32) -> bool| {
-        let coverage = mask.coverage().iter().zip(&labels).map(|(&c, &label)| if keep(label) { c } else { 0 });
-        let coverage: Vec<u8> = coverage.collect();
-        // Of the mask's own size, so it is never refused.
-        Mask::new(mask.width(), mask.height(), coverage).unwrap_or_else(|_| mask.clone())
-    };
-    (0..bodies.len() as u32)
-        .map(|own| (part(&|label| label == own), part(&|label| label != own && label != NOBODY)))
-        .collect()
+    (labels, depths)
 }
 
-/// Returns the pixels of bodies that clothes of a body in front may hide: those within [`CLOTHES_M`] of it in the image.
+/// Returns for each pixel whether it belongs to a body that clothes of a body in front may hide: within [`CLOTHES_M`] of it in the image.
 fn behind_clothes(
     camera: &Camera,
     labels: &[u32],
@@ -112,7 +118,7 @@ fn behind_clothes(
     hidden
 }
 
-/// The pixels left, right, above and below.
+/// Returns the pixels left, right, above and below.
 fn neighbours(at: usize, [width, height]: [usize; 2]) -> impl Iterator<Item = usize> {
     let (x, y) = (at % width, at / width);
     let all = [
@@ -124,7 +130,7 @@ fn neighbours(at: usize, [width, height]: [usize; 2]) -> impl Iterator<Item = us
     all.into_iter().flatten()
 }
 
-/// Visits the pixels whose centres lie in a triangle.
+/// Calls `visit` for the pixels whose centres lie in a triangle.
 fn draw([a, b, c]: [DVec2; 3], [width, height]: [usize; 2], mut visit: impl FnMut(usize)) {
     let (low, high) = (a.min(b).min(c), a.max(b).max(c));
     let first = |value: f64, side: usize| value.ceil().clamp(0.0, side as f64) as usize;
@@ -178,7 +184,7 @@ mod tests {
         }
     }
 
-    /// A square that faces the camera, `x` to its right, `y` behind the origin.
+    /// Returns a square that faces the camera, `x` to its right, `y` behind the origin.
     fn square(x: f32, y: f32, half: f32) -> PosedMesh<'static> {
         let corner = |sx: f32, sz: f32| Vec3::new(x + sx * half, y, sz * half);
         let vertices = vec![corner(-1.0, -1.0), corner(1.0, -1.0), corner(1.0, 1.0), corner(-1.0, 1.0)];

@@ -1,4 +1,4 @@
-//! The table `[appearance]`.
+//! Table `[appearance]`: the colours of the Gaussians.
 
 use std::path::{Path, PathBuf};
 
@@ -7,30 +7,30 @@ use flyrig_renderer::AppearanceSettings;
 use flyrig_stfa::{EMBEDDED, Parameters};
 use serde::{Deserialize, Serialize};
 
-use super::check;
-use crate::FusionError;
+use super::range::check;
+use crate::error::FusionError;
 
-/// How Gaussians get their colours.
+/// Method that colours the Gaussians.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize, ValueEnum)]
 #[serde(rename_all = "kebab-case")]
 pub enum AppearanceMode {
     /// Projection, spatial diffusion and temporal memory.
     #[default]
     Direct,
-    /// Without the temporal memory.
+    /// `direct` without the temporal memory.
     DirectNoTime,
     /// Projection only, as the paper's "w/o ST" baseline.
     DirectNoSpaceTime,
     /// `direct`, and the corrections of trained networks.
     Stfa,
-    /// The same without the temporal memory.
+    /// `stfa` without the temporal memory.
     StfaNoTime,
-    /// The same without graph and memory.
+    /// `stfa` without graph and memory.
     StfaNoSpaceTime,
 }
 
 impl AppearanceMode {
-    /// Returns the renderer's settings.
+    /// Returns the renderer's settings of the mode.
     #[must_use]
     pub fn settings(self) -> AppearanceSettings {
         let (space, time) = match self {
@@ -41,7 +41,7 @@ impl AppearanceMode {
         AppearanceSettings { space, time, ..AppearanceSettings::default() }
     }
 
-    /// Whether networks correct direct appearance.
+    /// Returns whether networks correct direct appearance.
     #[must_use]
     pub fn is_learned(self) -> bool {
         matches!(self, Self::Stfa | Self::StfaNoTime | Self::StfaNoSpaceTime)
@@ -59,11 +59,11 @@ pub enum NetworksOn {
     Adapter,
 }
 
-/// Which appearance, and with which networks.
+/// Settings of appearance and its networks.
 #[derive(Debug, Clone, PartialEq, Default, Serialize, Deserialize, Args)]
 #[serde(deny_unknown_fields, default)]
 pub struct AppearanceOptions {
-    /// How Gaussians get their colours.
+    /// Method that colours the Gaussians.
     #[arg(long = "appearance", value_enum, default_value = "direct")]
     pub mode: AppearanceMode,
     /// Weights file of the learned modes; "small" or "tiny" for the networks that come with flyrig [default: small].
@@ -74,7 +74,7 @@ pub struct AppearanceOptions {
     /// Gaussians none of whose inputs changed by more than this. 0 computes everything anew.
     #[arg(long, default_value_t = 0.0)]
     pub reuse: f32,
-    /// Where the networks run; "adapter" needs a flyrig that was built with the feature gpu-networks.
+    /// Device of the networks; "adapter" needs a flyrig that was built with the feature gpu-networks.
     #[arg(long, value_enum, default_value = "processor")]
     pub networks_on: NetworksOn,
 }
@@ -112,7 +112,7 @@ impl AppearanceOptions {
     }
 }
 
-/// A path, empty for `None`.
+/// Serialization of an optional path; empty for `None`.
 mod path_or_empty {
     use std::path::PathBuf;
 

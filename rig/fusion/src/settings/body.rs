@@ -1,4 +1,4 @@
-//! The table `[body]`.
+//! Table `[body]`: the surface of a person.
 
 use std::path::{Path, PathBuf};
 
@@ -6,17 +6,17 @@ use clap::Args;
 use flyrig_body::{DEFAULT_GAUSSIAN_COUNT, DEFAULT_NODE_COUNT};
 use serde::{Deserialize, Serialize};
 
-use super::check;
-use crate::FusionError;
+use super::range::check;
+use crate::error::FusionError;
 
-/// Fewest Gaussians for each node of a small deformation graph.
+/// Fewest Gaussians per node of a small deformation graph.
 const GAUSSIANS_A_NODE: usize = 12;
 
-/// The person's surface.
+/// Settings of the person's surface.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize, Args)]
 #[serde(deny_unknown_fields, default)]
 pub struct BodySettings {
-    /// A skinned glTF file; empty: the built-in body.
+    /// Skinned glTF file; empty: the built-in body.
     #[arg(skip)]
     pub template: PathBuf,
     /// Gaussians on the person's surface.
@@ -25,7 +25,7 @@ pub struct BodySettings {
     /// Nodes of the deformation graph.
     #[arg(long, default_value_t = DEFAULT_NODE_COUNT)]
     pub nodes: usize,
-    /// File of what was learnt about the person; empty: none.
+    /// File with the memory of the person; empty: none.
     #[arg(skip)]
     pub person: PathBuf,
     /// File of the first person's avatar: tracking and colours start from it; empty: none.
@@ -46,19 +46,19 @@ impl Default for BodySettings {
 }
 
 impl BodySettings {
-    /// Returns the defaults with another number of Gaussians, and a graph that is not too fine for them.
+    /// Returns the defaults with another number of Gaussians and a graph that is not too fine for them.
     #[must_use]
     pub fn with_gaussians(gaussians: usize) -> Self {
         Self { gaussians, nodes: DEFAULT_NODE_COUNT.min(gaussians / GAUSSIANS_A_NODE), ..Self::default() }
     }
 
-    /// The file of what was learnt about the person, where one is named.
+    /// Returns the file with the memory of the person, where one is named.
     #[must_use]
     pub fn person_file(&self) -> Option<&Path> {
         Some(self.person.as_path()).filter(|path| !path.as_os_str().is_empty())
     }
 
-    /// The file of the first person's avatar, where one is named.
+    /// Returns the file of the first person's avatar, where one is named.
     #[must_use]
     pub fn avatar_file(&self) -> Option<&Path> {
         Some(self.avatar.as_path()).filter(|path| !path.as_os_str().is_empty())

@@ -1,20 +1,21 @@
-//! The table `[budget]`.
+//! Table `[budget]`: the frame rate to keep up with.
 
 use clap::Args;
 use serde::{Deserialize, Serialize};
 
-use super::check;
-use crate::{Effort, FusionError};
+use super::effort::Effort;
+use super::range::check;
+use crate::error::FusionError;
 
-/// How fast sets have to be taken in.
+/// Settings of the time budget.
 #[derive(Debug, Clone, Copy, PartialEq, Default, Serialize, Deserialize, Args)]
 #[serde(deny_unknown_fields, default)]
 pub struct BudgetSettings {
-    /// Sets a second that are wanted: accuracy is given up, step by step, until so many are taken in; 0: none is.
+    /// Wanted frame sets per second: accuracy is given up, step by step, until so many are processed; 0: no accuracy is given up.
     // A name of its own: commands have frame rates as well.
     #[arg(id = "budget", long = "budget", value_name = "FPS", default_value_t = 0.0)]
     pub fps: f64,
-    /// The same effort for every set in place of a budget, for measurements.
+    /// Constant effort in place of a budget, for measurements.
     #[arg(skip)]
     #[serde(skip)]
     pub effort: Option<Effort>,

@@ -1,14 +1,14 @@
-//! The table `[perception]`.
+//! Table `[perception]`: the sources of poses, shapes and masks.
 
 use std::path::PathBuf;
 
 use clap::builder::{OsStringValueParser, TypedValueParser as _};
 use clap::{Args, ValueEnum};
-use flyrig_tracker::KeyColor;
+use flyrig_tracker::{KeyColor, PoseSettings};
 use serde::{Deserialize, Serialize};
 
-use super::check;
-use crate::FusionError;
+use super::range::check;
+use crate::error::FusionError;
 
 /// Source of a pose, a shape or a mask.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize, ValueEnum)]
@@ -21,10 +21,10 @@ pub enum Origin {
     Estimated,
 }
 
-/// Where poses, shapes and masks of people come from, and how people are found.
+/// Settings of perception: the sources of poses, shapes and masks, and the search for people.
 ///
-/// A configuration estimates everything by default. The options of commands that replay data sets take what comes with the
-/// data by default.
+/// A configuration estimates everything by default. The options of commands that replay data sets default to the poses, shapes and masks
+/// that come with the data.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize, Args)]
 #[serde(deny_unknown_fields, default)]
 pub struct PerceptionSettings {
@@ -34,14 +34,14 @@ pub struct PerceptionSettings {
     /// Masks from the data set, or from the images.
     #[arg(long, value_enum, default_value = "given")]
     pub masks: Origin,
-    /// Shape of the body from the data set's glTF file, or from the images; by default from where the pose comes.
+    /// Shape of the body from the data set's glTF file, or from the images; by default from the source of the pose.
     #[arg(long, value_enum)]
     pub shape: Option<Origin>,
     /// Fingers and the head's rotation: as the pose has them (with an estimated pose fingers are at rest), or from landmarks
     /// of hands and face in the images. The latter needs an estimated pose and a body with fingers, as the built-in one.
     #[arg(long, value_enum, default_value = "given")]
     pub hands: Origin,
-    /// People who are tracked at most, 1 to 4; with 1 the one whom most views agree on.
+    /// Largest number of tracked people, 1 to 4; with 1 the person on whom most views agree.
     #[arg(long, default_value_t = 1)]
     pub people: usize,
     /// Description of a landmark network to use in place of the one built in: a TOML file, see docs/guide/people.md. It needs
@@ -49,15 +49,10 @@ pub struct PerceptionSettings {
     #[arg(long, value_name = "FILE", default_value = "", hide_default_value = true,
         value_parser = OsStringValueParser::new().map(PathBuf::from))]
     pub network: PathBuf,
-    /// Distance that the body moves in a view until the network looks at that view again, metres; 0: at every view of every set.
-    #[arg(skip = Self::default().look_after_m)]
-    pub look_after_m: f64,
-    /// Height of an estimated person in metres; by default measured.
-    #[arg(long = "height", value_name = "METRES")]
-    pub height_m: Option<f64>,
-    /// Height of the floor in the calibration's world, metres: a single camera measures people by where their feet stand.
-    #[arg(long = "floor", value_name = "METRES", default_value_t = 0.0, allow_negative_numbers = true)]
-    pub floor_m: f64,
+    /// Settings of the pose, as keys of this table.
+    #[command(flatten)]
+    #[serde(flatten)]
+    pub tracker: PoseSettings,
     /// Colour of a screen behind the people: "green", "blue" or one like "#00b140"; empty without a screen.
     #[arg(long, value_name = "COLOUR", default_value = "", hide_default_value = true)]
     pub key_color: String,
@@ -77,9 +72,7 @@ impl Default for PerceptionSettings {
             shape: None,
             people: 1,
             network: PathBuf::new(),
-            look_after_m: 0.02,
-            height_m: None,
-            floor_m: 0.0,
+            tracker: PoseSettings::default(),
             key_color: String::new(),
             plates: PathBuf::new(),
         }
@@ -93,7 +86,7 @@ impl PerceptionSettings {
         Self { pose: Origin::Given, masks: Origin::Given, ..Self::default() }
     }
 
-    /// Where the shape comes from.
+    /// Returns the source of the shape.
     #[must_use]
     pub fn shape(&self) -> Origin {
         self.shape.unwrap_or(self.pose)
@@ -112,7 +105,7 @@ impl PerceptionSettings {
     /// [`FusionError::Setting`] names the key and the range.
     pub fn validate(&self) -> Result<(), FusionError> {
         check("perception.people", self.people as f64, 1.0, 4.0)?;
-        check("perception.look_after_m", self.look_after_m, 0.0, 1.0)?;
+        check("perception.look_after_m", self.tracker.look_after_m, 0.0, 1.0)?;
         self.key()?;
         if self.hands == Origin::Estimated && self.pose == Origin::Given {
             return Err(FusionError::Setting(
@@ -120,7 +113,7 @@ impl PerceptionSettings {
                     .to_owned(),
             ));
         }
-        check("perception.floor_m", self.floor_m, -10.0, 10.0)?;
-        self.height_m.map_or(Ok(()), |height| check("perception.height_m", height, 0.5, 2.5))
+        check("perception.floor_m", self.tracker.floor_m, -10.0, 10.0)?;
+        self.tracker.height_m.map_or(Ok(()), |height| check("perception.height_m", height, 0.5, 2.5))
     }
 }

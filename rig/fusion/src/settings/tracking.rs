@@ -1,26 +1,26 @@
-//! The table `[tracking]`.
+//! Table `[tracking]`: the deformation of the surface.
 
 use clap::{Args, ValueEnum};
 use flyrig_tracker::{DeformSettings, DeformSolver};
 use serde::{Deserialize, Serialize};
 
-use super::check;
-use crate::{FusionError, deformation::DeformOptions};
+use super::range::check;
+use crate::{deformation::options::DeformOptions, error::FusionError};
 
-/// Weight of the nodes' distance from where clothes of their part's thickness would be: it holds what no view constrains, the
-/// depth before a single camera or a shift of all nodes that a corrected pose explains as well.
+/// Weight of the nodes' distance from where clothes of their part's thickness would be. It holds what no view constrains: the depth before a
+/// single camera, or a shift of all nodes that a corrected pose explains as well.
 const ANCHOR: f64 = 100.0;
 /// λ_reg of the paper's Eq. 3.
 const PAPER_REGULARIZATION: f64 = 200.0;
-/// Rate of the paper's gradient descent, square metres a unit of loss. The paper does not state its own; of 1e-8 to 1e-5
-/// this one lowered the loss most on a simulated person at 512x512.
+/// Rate of the paper's gradient descent, square metres per unit of loss. The paper states none; of 1e-8 to 1e-5 this one lowered the loss
+/// most on a simulated person at 512x512.
 const PAPER_RATE: f64 = 3e-6;
 
-/// How the body is deformed beyond its pose.
+/// Solver of the deformation beyond the pose.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize, ValueEnum)]
 #[serde(rename_all = "kebab-case")]
 pub enum Solver {
-    /// Skinned only.
+    /// No deformation: the body is only skinned.
     #[value(name = "off", alias = "none")]
     #[serde(rename = "off", alias = "none")]
     None,
@@ -34,7 +34,7 @@ pub enum Solver {
 }
 
 impl Solver {
-    /// Returns the options of the deformation, `None` when the body is only skinned.
+    /// Returns the options of the deformation; `None` where the body is only skinned.
     #[must_use]
     pub fn options(self) -> Option<DeformOptions> {
         let default = DeformSettings::default();
@@ -52,26 +52,26 @@ impl Solver {
     }
 }
 
-/// How the surface follows the images.
+/// Settings of the deformation.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize, Args)]
 #[serde(deny_unknown_fields, default)]
 pub struct TrackingSettings {
-    /// How the body follows the images beyond its pose; "off" is faster.
+    /// Solver with which the body follows the images beyond its pose; "off" is faster.
     #[arg(long, value_enum, default_value = "default")]
     pub solver: Solver,
-    /// Gaussians that the default solver compares with the images; the others follow.
+    /// Number of Gaussians that the default solver compares with the images; the others follow.
     #[arg(skip = Self::default().gaussians)]
     pub gaussians: usize,
-    /// Compare no finer than the images resolve.
+    /// Whether images are compared no finer than is informative.
     #[arg(skip = Self::default().level_of_detail)]
     pub level_of_detail: bool,
-    /// Views that are compared at most; 0: all.
+    /// Largest number of compared views; 0: all.
     #[arg(skip = Self::default().views)]
     pub views: usize,
-    /// Relative growth of the loss up to which a frame gets no iteration, once the solver has converged.
+    /// Relative growth of the loss up to which a frame set gets no iteration, once the solver has converged.
     #[arg(skip = Self::default().rest)]
     pub rest: f64,
-    /// Explain every image with the pose of its own capture time.
+    /// Whether every image is explained with the pose of its own capture time.
     #[arg(skip = Self::default().per_view_time)]
     pub per_view_time: bool,
     /// Options of the deformation in place of those that the settings above imply, for measurements.
@@ -95,7 +95,7 @@ impl Default for TrackingSettings {
 }
 
 impl TrackingSettings {
-    /// Returns the options of the deformation, `None` when the body is only skinned.
+    /// Returns the options of the deformation; `None` where the body is only skinned.
     #[must_use]
     pub fn options(&self) -> Option<DeformOptions> {
         let mut options = self.solver.options()?;
@@ -127,7 +127,7 @@ impl TrackingSettings {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::deformation::PAPER_COLOR_WEIGHT;
+    use crate::deformation::options::PAPER_COLOR_WEIGHT;
 
     #[test]
     fn the_papers_solver_has_the_papers_weights() {

@@ -1,4 +1,4 @@
-//! A small scene for sessions: cameras on a circle, people of the built-in body who stand still, painted silhouettes.
+//! Small scene for sessions: cameras on a circle, still people with the built-in body, painted silhouettes.
 #![allow(dead_code, clippy::unwrap_used)] // each test uses a part; a test may fail by panicking
 
 use std::{
@@ -51,14 +51,14 @@ pub fn template() -> Template {
     default_template(&ShapeParams::default()).unwrap()
 }
 
-/// The rest pose, so far to the right of the first camera's middle.
+/// Returns the rest pose, `x` metres to the right of the first camera's middle.
 pub fn pose(x: f64) -> Pose {
     let mut pose = template().skeleton.rest_pose();
     pose.root_translation.x += x;
     pose
 }
 
-/// People who stand at these places.
+/// Returns people who stand at these positions, metres.
 pub fn people(rig: &Rig, at: &[(u32, f64)]) -> GivenPerception {
     let person = |&(person, x): &(u32, f64)| GivenPerson {
         person: PersonId(person),
@@ -79,7 +79,7 @@ pub fn session(gpu: GpuContext, at: &[(u32, f64)]) -> Session {
     SessionBuilder::new(gpu, rig).settings(settings(3000)).perception(people).build().unwrap()
 }
 
-/// A set of these images and masks, by slot.
+/// Returns a frame set of these images and masks, one per slot.
 pub fn frame_set(index: u64, images: &[(Vec<u8>, Vec<u8>)]) -> FrameSet {
     let nanos = index as i64 * PERIOD_NANOS;
     let frame = |(camera, (rgb, mask)): (&Camera, &(Vec<u8>, Vec<u8>))| {
@@ -95,7 +95,7 @@ pub fn frame_set(index: u64, images: &[(Vec<u8>, Vec<u8>)]) -> FrameSet {
     FrameSet { index, master_nanos: nanos, frames: rig().cameras.iter().zip(images).map(frame).collect() }
 }
 
-/// Coverage of one person at a place, by camera of the rig.
+/// Renders the coverage of one person at a position, one element per camera.
 pub fn silhouettes(x: f64) -> Vec<Vec<u8>> {
     let mut session = session(gpu(), &[(0, x)]);
     // Without any mask the person is posed only.
@@ -105,7 +105,7 @@ pub fn silhouettes(x: f64) -> Vec<Vec<u8>> {
     views.map(|rgba| rgba.chunks_exact(4).map(|p| p[3]).collect()).collect()
 }
 
-/// Images of people at these places in these colours, each hiding those who are farther away, and everybody's mask.
+/// Renders images of people at these positions in these colours, nearer ones hiding farther ones, with the mask of all people.
 pub fn images(people: &[(f64, [u8; 3])]) -> Vec<(Vec<u8>, Vec<u8>)> {
     let all: Vec<(f64, [u8; 3], Vec<Vec<u8>>)> = people.iter().map(|&(x, c)| (x, c, silhouettes(x))).collect();
     let of = |(slot, camera): (usize, &Camera)| {
@@ -124,7 +124,7 @@ pub fn images(people: &[(f64, [u8; 3])]) -> Vec<(Vec<u8>, Vec<u8>)> {
     rig().cameras.iter().enumerate().map(of).collect()
 }
 
-/// Plays the frames of one slot.
+/// Source that plays the frames of one slot.
 struct Played {
     camera: CameraId,
     frames: std::vec::IntoIter<Frame>,
@@ -141,7 +141,7 @@ impl CameraSource for Played {
     }
 }
 
-/// Cameras that play sets through.
+/// Returns cameras that play frame sets.
 pub fn played(sets: &[FrameSet]) -> Vec<Box<dyn CameraSource>> {
     let source = |slot: usize| {
         let copy = |set: &FrameSet| {

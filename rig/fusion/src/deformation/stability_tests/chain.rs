@@ -1,5 +1,5 @@
-//! The whole chain, plainly and slowly in f64: images in, displaced positions out. Written from the equations; it
-//! shares the skeleton, the f64 skinning and the inset of the surface with the product.
+//! Reference of the whole deformation in plain f64: images in, displaced positions out. Written from the equations, it shares only the
+//! skeleton, the f64 skinning and the inset of the surface with the product.
 
 use flyrig_body::{SurfaceGaussians, skin_jacobian_f64, skin_point_f64};
 use flyrig_renderer::{Outputs, RasterSettings, linear_from_srgb};
@@ -10,18 +10,18 @@ use glam::{DMat3, DMat4, DVec3};
 use super::super::DeformOptions;
 use super::reference::{self, Picture, Splat, blend, sorted_splats_at};
 use super::reference_backward::{Incoming, backward, lift, touched_by};
-use super::small_scene::{Shot, SmallScene};
+use super::small_scene::{SceneShot, SmallScene};
 
-/// A person 400 pixels high.
+/// Pixels per square metre of a person 400 pixels high.
 const PAPER_PIXELS_A_M2: f64 = (400.0 / 1.75) * (400.0 / 1.75);
 
-/// An image as it is compared.
+/// Image at the size that is compared.
 struct View {
     camera: Camera,
     bones: Vec<DMat4>,
     /// Premultiplied linear colour and coverage.
     wanted: Vec<[f64; 4]>,
-    /// Of colour and mask.
+    /// Weights of the three colour channels and the mask.
     weights: [f64; 4],
     raster: RasterSettings,
 }
@@ -30,14 +30,14 @@ pub struct Chain<'a> {
     scene: &'a SmallScene,
     settings: DeformSettings,
     max_level: u32,
-    /// Conjugate gradients end at this share of the first residual.
+    /// Share of the first residual at which conjugate gradients end.
     tolerance: f64,
     rest: SurfaceGaussians,
-    /// Nodes and stiffness.
+    /// Neighbouring nodes and stiffness of each edge.
     edges: Vec<(usize, usize, f64)>,
     pub translations: Vec<DVec3>,
     smooth: Vec<DVec3>,
-    /// How thick the clothes of every part are, metres.
+    /// Thickness of the clothes on each part, metres.
     thickness: Option<Vec<f64>>,
     damping: f64,
     floor: Option<f64>,
@@ -71,18 +71,18 @@ impl<'a> Chain<'a> {
         }
     }
 
-    /// Eq. 2.
+    /// Returns the displacement of a Gaussian by Eq. 2, metres.
     fn displacement(&self, t: &[DVec3], g: usize) -> DVec3 {
         let (nodes, weights) = (self.scene.graph.gaussian_nodes[g], self.scene.graph.gaussian_weights[g]);
         (0..4).map(|k| t[nodes[k] as usize] * f64::from(weights[k])).sum()
     }
 
-    /// World centres of all Gaussians.
+    /// Returns the world centres of all Gaussians, metres.
     pub fn centers(&self, bones: &[DMat4]) -> Vec<DVec3> {
         self.scene.posed(&self.rest, bones, |g| self.displacement(&self.translations, g)).1
     }
 
-    fn views(&self, shot: &Shot) -> Vec<View> {
+    fn views(&self, shot: &SceneShot) -> Vec<View> {
         let SmallScene { template, surface, graph, cameras, .. } = self.scene;
         let spacing = (template.area_m2() / surface.len() as f64).sqrt();
         let view = |((camera, pose), rgba): ((&Camera, _), &Vec<u8>)| {
@@ -116,12 +116,12 @@ impl<'a> Chain<'a> {
         (scene, splats, picture)
     }
 
-    /// Eq. 3 without its regulariser.
+    /// Returns the loss of Eq. 3 without its regulariser.
     fn data_loss(&self, views: &[View], t: &[DVec3]) -> f64 {
         views.iter().map(|view| image_loss(view, &self.draw(view, t).2.color)).sum()
     }
 
-    /// The data's loss, gradient by the nodes and Gauss-Newton matrix.
+    /// Returns the data term's loss, its gradient with respect to the nodes, and the Gauss-Newton matrix.
     fn derivatives(&self, views: &[View], t: &[DVec3]) -> (f64, Vec<DVec3>, Vec<Vec<DMat3>>) {
         let nodes = t.len();
         let (mut loss, mut gradient) = (0.0, vec![DVec3::ZERO; nodes]);
@@ -153,7 +153,7 @@ impl<'a> Chain<'a> {
         (loss, gradient, matrix)
     }
 
-    /// Eq. 4 and its gradient.
+    /// Returns the regulariser of Eq. 4 and its gradient.
     fn prior(&self, t: &[DVec3]) -> (f64, Vec<DVec3>) {
         let (spatial, temporal) = self.prior_weights();
         let (mut loss, mut gradient) = (0.0, vec![DVec3::ZERO; t.len()]);
@@ -168,7 +168,7 @@ impl<'a> Chain<'a> {
         (loss, gradient)
     }
 
-    /// Where a node would be, were it clothed like its part.
+    /// Returns the translation of a node with clothes as thick as those of its part, metres.
     fn offset(&self, node: usize) -> DVec3 {
         let (normal, part) = self.normal_and_part(node);
         self.thickness.as_ref().map_or(DVec3::ZERO, |thickness| normal * thickness[part])
@@ -179,7 +179,7 @@ impl<'a> Chain<'a> {
         (self.scene.surface.normals[g].as_dvec3(), self.scene.surface.parts[g] as usize)
     }
 
-    /// Means along the normals by part, weighted by what the data say; a hundredth is everybody's.
+    /// Returns the mean thickness along the normals for each part, weighted by the data; one hundredth of the weight is the mean of all parts.
     fn learn(&mut self, blocks: &[DMat3]) {
         let parts = (0..blocks.len()).map(|n| self.normal_and_part(n).1 + 1).max().unwrap_or(0);
         let (mut weights, mut sums) = (vec![0.0; parts], vec![0.0; parts]);
@@ -209,8 +209,8 @@ impl<'a> Chain<'a> {
         (s.regularization * s.spatial, if self.frame > 0 { s.regularization * s.temporal } else { 0.0 })
     }
 
-    /// Takes in one frame; the losses before the first and after each accepted step.
-    pub fn track(&mut self, shot: &Shot) -> Vec<f64> {
+    /// Solves one frame; returns the losses before the first and after each accepted step.
+    pub fn track(&mut self, shot: &SceneShot) -> Vec<f64> {
         let views = self.views(shot);
         let total = |chain: &Self, t: &[DVec3]| chain.data_loss(&views, t) + chain.prior(t).0;
         if let Some(floor) = self.floor.filter(|_| self.frame >= 10) {
@@ -292,7 +292,7 @@ impl<'a> Chain<'a> {
     }
 }
 
-/// Means of `side` x `side` pixels, in linear light and by coverage.
+/// Returns means of `side` x `side` pixels in linear light, weighted by coverage.
 fn wanted(rgba: &[u8], width: usize, height: usize, side: usize) -> Vec<[f64; 4]> {
     let pixel = |x: usize, y: usize| {
         let mut mean = [0.0; 4];
@@ -316,7 +316,7 @@ fn image_loss(view: &View, drawn: &[[f64; 4]]) -> f64 {
     drawn.iter().zip(&view.wanted).map(pixel).sum()
 }
 
-/// dL/d the image, and of the Gauss-Newton matrix what a shift of the image by a pixel does.
+/// Returns the derivative of the loss with respect to the image, and the Gauss-Newton term of a shift by one pixel.
 fn incoming(view: &View, drawn: &[[f64; 4]]) -> Incoming<f64> {
     let width = view.camera.intrinsics.width as usize;
     let height = drawn.len() / width;
@@ -344,7 +344,7 @@ fn incoming(view: &View, drawn: &[[f64; 4]]) -> Incoming<f64> {
     }
 }
 
-/// Conjugate gradients over dense blocks, preconditioned by those of the diagonal.
+/// Solves by conjugate gradients over dense blocks, preconditioned by the diagonal blocks.
 fn conjugate_gradients(matrix: &[Vec<DMat3>], right: &[DVec3], tolerance: f64) -> Vec<DVec3> {
     let dot = |a: &[DVec3], b: &[DVec3]| a.iter().zip(b).map(|(a, b)| a.dot(*b)).sum::<f64>();
     let times = |x: &[DVec3]| -> Vec<DVec3> {

@@ -1,17 +1,17 @@
-//! Geometry that nobody should have, through the whole chain.
+//! Degenerate geometry through the whole deformation.
 
 use flyrig_body::{DEFAULT_SIGMA2_M2, build_graph};
 use flyrig_types::Isometry;
 use glam::{DVec2, DVec3, Vec3};
 
-use super::small_scene::{Device, Shot, SmallScene};
+use super::small_scene::{SceneShot, SmallScene, TestedDeformation};
 use super::{gpu, options};
 
 struct Hard {
     name: &'static str,
     scene: fn(&mut SmallScene),
-    shot: fn(&mut Shot),
-    /// Whether there is something to follow.
+    shot: fn(&mut SceneShot),
+    /// Whether there is anything to follow.
     moves: Option<bool>,
 }
 
@@ -34,7 +34,7 @@ fn look(scene: &mut SmallScene, eye: DVec3, target: DVec3) {
     }
 }
 
-/// Nothing hangs on node 0, and it has no neighbours.
+/// Scene in which no Gaussian hangs on node 0, which has no neighbours.
 fn isolate(scene: &mut SmallScene) {
     let graph = &mut scene.graph;
     graph.neighbors[0] = [0; 4];
@@ -48,7 +48,7 @@ fn isolate(scene: &mut SmallScene) {
     }
 }
 
-/// All Gaussians on node 2 are transparent.
+/// Scene in which all Gaussians on node 2 are transparent.
 fn hide(scene: &mut SmallScene) {
     for ((nodes, weights), color) in
         scene.graph.gaussian_nodes.iter().zip(&scene.graph.gaussian_weights).zip(&mut scene.colors)
@@ -59,12 +59,12 @@ fn hide(scene: &mut SmallScene) {
     }
 }
 
-fn masks(shot: &mut Shot, value: u8) {
+fn masks(shot: &mut SceneShot, value: u8) {
     shot.rgba.iter_mut().for_each(|rgba| rgba.iter_mut().skip(3).step_by(4).for_each(|a| *a = value));
 }
 
 const MIDDLE: DVec3 = DVec3::new(0.0, 0.9, 0.0);
-const AS_SEEN: fn(&mut Shot) = |_| ();
+const AS_SEEN: fn(&mut SceneShot) = |_| ();
 
 const CASES: [Hard; 22] = [
     Hard { name: "nothing", scene: |_| (), shot: AS_SEEN, moves: Some(true) },
@@ -129,7 +129,7 @@ fn hard_scenes_give_finite_steps_that_never_raise_the_loss() {
         let mut scene = SmallScene::new(80, 10, 48);
         spoil(&mut scene);
         seen.cameras.clone_from(&scene.cameras);
-        let mut device = Device::new(gpu(), &scene, options());
+        let mut device = TestedDeformation::new(gpu(), &scene, options());
         let (mut steps, mut losses) = (0, Vec::new());
         for frame in 0..3 {
             let mut shot = seen.shot(f64::from(frame));

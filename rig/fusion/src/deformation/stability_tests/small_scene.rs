@@ -1,4 +1,4 @@
-//! A person of tens of Gaussians before three small cameras, and the chain that is tested.
+//! Person of tens of Gaussians before three small cameras, and the deformation that is tested.
 
 use flyrig_body::{
     DEFAULT_SIGMA2_M2, DeformationGraph, GpuSkinner, ShapeParams, SurfaceGaussians, Template, build_graph,
@@ -10,9 +10,13 @@ use flyrig_tracker::DeformReport;
 use flyrig_types::{Camera, Intrinsics, Isometry, Lens, Pose};
 use glam::{DMat4, DQuat, DVec3, Vec3};
 
-use super::super::{DeformOptions, Deformation, Instants, TrackedView};
+use super::super::{
+    DeformOptions, Deformation,
+    scene::{TrackedPerson, TrackedView},
+};
 use super::reference::{self, blend, sorted_splats_at};
 
+/// Person and cameras.
 pub struct SmallScene {
     pub template: Template,
     pub surface: SurfaceGaussians,
@@ -23,7 +27,7 @@ pub struct SmallScene {
 }
 
 /// Images of one frame, each with its own pose.
-pub struct Shot {
+pub struct SceneShot {
     pub poses: Vec<Pose>,
     /// sRGB bytes with coverage.
     pub rgba: Vec<Vec<u8>>,
@@ -40,7 +44,7 @@ impl SmallScene {
         Self { template, surface, graph, colors, cameras }
     }
 
-    /// Turns once in 150 frames and swings its limbs.
+    /// Returns the pose in a frame: the person turns once in 150 frames and swings its limbs.
     pub fn pose(&self, frame: f64) -> Pose {
         let mut pose = self.template.skeleton.rest_pose();
         for (joint, rotation) in pose.joint_rotations.iter_mut().enumerate().skip(1) {
@@ -54,14 +58,14 @@ impl SmallScene {
         pose
     }
 
-    /// Where the clothes are, canonical metres from the skin: up to 3 cm, swinging once in 40 frames.
+    /// Returns the displacement of the clothes from the skin, canonical metres: up to 3 cm, swinging once in 40 frames.
     pub fn cloth(x: Vec3, frame: f64) -> DVec3 {
         let x = x.as_dvec3() * 7.0;
         let size = 0.01 + 0.005 * (frame * std::f64::consts::TAU / 40.0).sin();
         size * DVec3::new(x.y.sin() + x.z.cos(), (x.x + x.z).sin(), x.y.cos() + (x.x * 1.3).sin())
     }
 
-    /// World centres of the Gaussians of `rest` displaced by `by`, and the scene as the reference draws it.
+    /// Returns the scene as the reference draws it, and the world centres of the Gaussians of `rest` displaced by `by`.
     pub fn posed(
         &self,
         rest: &SurfaceGaussians,
@@ -80,10 +84,10 @@ impl SmallScene {
         (scene, centers)
     }
 
-    /// What the cameras see: each exposes a quarter of a frame after the one before it.
-    pub fn shot(&self, frame: f64) -> Shot {
+    /// Renders the cameras' images of a frame: each exposes a quarter of a frame after the one before it.
+    pub fn shot(&self, frame: f64) -> SceneShot {
         let rest = self.surface.inset();
-        let mut shot = Shot { poses: Vec::new(), rgba: Vec::new() };
+        let mut shot = SceneShot { poses: Vec::new(), rgba: Vec::new() };
         for (k, camera) in self.cameras.iter().enumerate() {
             let pose = self.pose(frame + 0.25 * k as f64);
             let bones = self.template.skeleton.world_from_canonical(&pose);
@@ -102,8 +106,8 @@ impl SmallScene {
         shot
     }
 
-    /// A shot as the deformation takes it.
-    pub fn views<'a>(&'a self, shot: &'a Shot, images: &'a [StorageBuffer<u32>]) -> Vec<TrackedView<'a>> {
+    /// Returns a shot as inputs of the deformation.
+    pub fn views<'a>(&'a self, shot: &'a SceneShot, images: &'a [StorageBuffer<u32>]) -> Vec<TrackedView<'a>> {
         let cameras = self.cameras.iter().zip(&shot.rgba).zip(images).enumerate();
         let view = |(instant, ((camera, rgba), words)): (usize, ((&'a Camera, &'a Vec<u8>), _))| TrackedView {
             camera,
@@ -117,7 +121,7 @@ impl SmallScene {
     }
 }
 
-/// Looks at the middle of the body from 3 m away.
+/// Returns a camera that looks at the middle of the body from 3 m away.
 fn camera(azimuth: f64, side: u32) -> Camera {
     let middle = DVec3::new(0.0, 0.9, 0.0);
     let eye = middle + DVec3::new(azimuth.sin(), 0.15, azimuth.cos()) * 3.0;
@@ -126,15 +130,15 @@ fn camera(azimuth: f64, side: u32) -> Camera {
     Camera::new(format!("{azimuth}"), intrinsics, Isometry::look_at(eye, middle, DVec3::Y))
 }
 
-/// The deformation as the engine runs it.
-pub struct Device {
+/// Deformation as a session runs it.
+pub struct TestedDeformation {
     gpu: GpuContext,
     pub deformation: Deformation,
     gaussians: GaussianBuffers,
     skinner: GpuSkinner,
 }
 
-impl Device {
+impl TestedDeformation {
     pub fn new(gpu: &GpuContext, scene: &SmallScene, options: DeformOptions) -> Self {
         let gaussians = GaussianBuffers::zeroed(gpu, scene.surface.len()).unwrap();
         gaussians.color.write(gpu, &scene.colors);
@@ -146,10 +150,10 @@ impl Device {
         }
     }
 
-    /// None when there is nothing to compare with.
-    pub fn track(&mut self, scene: &SmallScene, shot: &Shot) -> Option<DeformReport> {
+    /// Solves one frame; `None` without anything to compare with.
+    pub fn track(&mut self, scene: &SmallScene, shot: &SceneShot) -> Option<DeformReport> {
         let instants: Vec<&Pose> = shot.poses.iter().collect();
-        let lent = Instants {
+        let lent = TrackedPerson {
             gpu: &self.gpu,
             skeleton: &scene.template.skeleton,
             poses: &instants,
@@ -161,7 +165,7 @@ impl Device {
         self.deformation.report().cloned()
     }
 
-    /// World centres and scales of all Gaussians in a pose.
+    /// Returns world centres and scales of all Gaussians in a pose.
     pub fn centers(&self, scene: &SmallScene, pose: &Pose) -> Vec<[f32; 4]> {
         let mut encoder = self.gpu.device.create_command_encoder(&Default::default());
         let (centers, normals): (&StorageBuffer<_>, _) = (&self.gaussians.center_scale, &self.gaussians.normal);

@@ -1,0 +1,26 @@
+//! One person: template, Gaussians on the GPU, deformation, colours and tracking quality.
+//!
+//! [`person`] has the [`Subject`] and its update, [`geometry`] the deformation and skinning, [`painter`] the colours. [`memory`] outlives
+//! the subject, [`stream_frame`] is what viewers get of it.
+
+mod geometry;
+pub(crate) mod inputs;
+mod instants;
+pub(crate) mod memory;
+mod memory_file;
+mod painter;
+pub(crate) mod person;
+mod pose_curve;
+mod resume;
+mod schedule;
+mod stage_clock;
+pub(crate) mod stream_frame;
+mod surface;
+pub(crate) mod track_watch;
+
+pub use geometry::PROCESSOR_STAGE;
+pub use memory::PersonMemory;
+pub use person::{Observed, Subject};
+pub use stream_frame::{PersonFrame, stream_joints};
+pub use surface::{person_gaussians, person_surface};
+pub use track_watch::{Remedy, TrackState, TrackWatch};

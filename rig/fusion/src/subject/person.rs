@@ -1,0 +1,323 @@
+//! One person: template, Gaussians on the GPU, deformation, colours and tracking quality.
+//!
+//! [`Subject::update`] reconstructs the person in one frame set:
+//!
+//! 1. [`Inputs`] converts and uploads the images with the person's masks.
+//! 2. [`Instants`] collects the poses at which the images were taken.
+//! 3. [`Geometry`] solves the deformation against the images and skins the Gaussians at every instant.
+//! 4. [`GaussianPainter`] renders canonical positions and the last colours into every view, and updates the colours from the pixels at the
+//!    surface; in the learned modes networks then correct them.
+//!
+//! Nothing waits between skinning and painting where the adapter has timestamps: [`StageClock`] collects their times with the next
+//! wait. [`PersonMemory`] outlives the subject, and a [`PersonFrame`] is what viewers get of it.
+
+use std::sync::Arc;
+
+use flyrig_body::{Outfit, Template};
+use flyrig_gpu::GpuContext;
+use flyrig_renderer::{GaussianBuffers, Observations, Rasterizer, Splat, read_splats};
+use flyrig_stfa::BodyGraph;
+use flyrig_stream::{EncodedTemplate, Motion, Stamp};
+use flyrig_tracker::DeformReport;
+use flyrig_types::{PersonId, Pose, Rig};
+use glam::{DVec3, Vec3};
+
+use super::{
+    geometry::Geometry,
+    inputs::{InputImage, InputView, Inputs},
+    instants::Instants,
+    memory::PersonMemory,
+    painter::{GaussianPainter, PaintInputs, PaintTools},
+    pose_curve::PoseCurve,
+    schedule::Schedule,
+    stage_clock::StageClock,
+    stream_frame::{PersonFrame, encode_template, motion},
+    surface::person_surface,
+    track_watch::TrackWatch,
+};
+use crate::{
+    error::FusionError,
+    health::stage_times::StageTimes,
+    settings::{effort::Effort, session::SessionSettings},
+};
+
+/// Inputs and results of a person's last update, read back: the raw material of training samples.
+#[derive(Debug)]
+pub struct Observed {
+    /// Observations of direct appearance, one element per observing view.
+    pub observations: Observations,
+    /// Slots of the observing views' cameras.
+    pub slots: Vec<usize>,
+    /// Images of the observing views: width, height, and sRGB pixels with the mask as alpha.
+    pub pictures: Vec<(u32, u32, Vec<u8>)>,
+    /// World centre of each Gaussian, metres; w: scale.
+    pub center_scale: Vec<[f32; 4]>,
+    /// World normal of each Gaussian; w: depth below the rendered surface, metres.
+    pub normal: Vec<[f32; 4]>,
+}
+
+/// Shape of a person, with and without clothes.
+#[derive(Debug)]
+pub(super) struct PersonShape {
+    /// Template that is posed and drawn: dressed.
+    pub template: Template,
+    /// Body below the clothes, and the clothes; `None` without any.
+    undressed: Option<(Template, Outfit)>,
+    /// Template of the person stream, for viewers that draw the person themselves.
+    pub stream: Arc<EncodedTemplate>,
+}
+
+/// Pose and tracking quality over the frame sets.
+#[derive(Debug, Default)]
+pub(crate) struct PersonTrack {
+    /// Last poses, for the times between and shortly after them.
+    pub curve: PoseCurve,
+    pub watch: TrackWatch,
+    pub last_pose: Option<Pose>,
+    /// Confidence in the last pose, 0..=1.
+    pub confidence: f64,
+    /// Slots of the views that the last update used.
+    pub viewed: Vec<usize>,
+}
+
+/// One person as Gaussians on the GPU, with shape, deformation, colour memory and tracking quality.
+#[derive(Debug)]
+pub struct Subject {
+    pub(super) id: PersonId,
+    /// Number of the shape, see [`crate::KnownPerson`].
+    pub(crate) shape_number: u32,
+    pub(super) shape: PersonShape,
+    /// Deformation graph as the networks see it.
+    body_graph: BodyGraph,
+    inputs: Inputs,
+    pub(super) geometry: Geometry,
+    pub(super) painter: GaussianPainter,
+    pub(super) schedule: Schedule,
+    clock: StageClock,
+    /// Shape and colours that the person starts with, where they are known before the first image.
+    pub(super) start: Option<Arc<PersonMemory>>,
+    pub(crate) track: PersonTrack,
+}
+
+impl Subject {
+    /// Samples the template's surface and prepares the GPU for the input cameras of `rig`. Takes a few seconds.
+    pub(crate) fn new(
+        gpu: &GpuContext,
+        id: PersonId,
+        (body, outfit): (Template, Outfit),
+        rig: &Rig,
+        settings: &SessionSettings,
+    ) -> Result<Self, FusionError> {
+        let template = outfit.on(&body)?;
+        let (surface, graph) = person_surface(&template, &settings.body)?;
+        let is_deformed = settings.tracking.options().is_some();
+        let inset = is_deformed.then(|| surface.inset());
+        let rendered = inset.as_ref().unwrap_or(&surface);
+        let stream = encode_template(rendered, is_deformed.then_some(&graph), &template.skeleton)?;
+        let body_graph = BodyGraph::new(&surface, &graph)?;
+        Ok(Self {
+            id,
+            shape_number: 0,
+            geometry: Geometry::new(gpu, &template, (&surface, rendered), &graph, rig, settings)?,
+            painter: GaussianPainter::new(gpu, &surface, &graph, &body_graph, rig.cameras.len(), settings)?,
+            shape: PersonShape {
+                template,
+                undressed: (!outfit.is_bare()).then_some((body, outfit)),
+                stream: Arc::new(stream),
+            },
+            body_graph,
+            inputs: Inputs::default(),
+            schedule: Schedule::default(),
+            clock: StageClock::new(gpu),
+            start: None,
+            track: PersonTrack::default(),
+        })
+    }
+
+    /// Reconstructs the person in one frame set: deformation, Gaussians, then colours from the views. A view whose mask is empty adds
+    /// nothing.
+    pub(crate) fn update(
+        &mut self,
+        gpu: &GpuContext,
+        rasterizer: &mut Rasterizer,
+        pose: &Pose,
+        views: &[InputView<'_>],
+        effort: Effort,
+        stages: &mut StageTimes,
+    ) -> Result<(), FusionError> {
+        let work = self.schedule.next(effort);
+        stages.time("convert images", || self.inputs.upload(gpu, views))?;
+        // One update at a time is under way, and none while the processor's time is measured.
+        gpu.wait()?;
+        self.clock.collect(stages);
+
+        let skeleton = &self.shape.template.skeleton;
+        let instants = Instants::new(pose, views);
+        self.geometry.reserve(gpu, instants.poses().len())?;
+        if work.solves {
+            self.geometry.deform(gpu, skeleton, &instants, views, &self.inputs, stages)?;
+        }
+        self.geometry.skin(gpu, skeleton, &instants, &mut self.clock, stages)?;
+        if !work.paints {
+            self.painter.skip();
+            stages.count("sets not painted", 1);
+            return Ok(());
+        }
+        let (geometry, instants, images) = (&self.geometry, &instants, &self.inputs);
+        let inputs = PaintInputs { gpu, geometry, instants, views, images };
+        self.painter.paint(inputs, &mut PaintTools { rasterizer, clock: &mut self.clock, stages })
+    }
+
+    /// Adds the adapter's times of updates that were waited for.
+    pub(crate) fn collect_times(&mut self, stages: &mut StageTimes) {
+        self.clock.collect(stages);
+    }
+
+    /// Returns the person's id.
+    #[must_use]
+    pub fn id(&self) -> PersonId {
+        self.id
+    }
+
+    /// Returns the template that is posed: dressed.
+    #[must_use]
+    pub fn template(&self) -> &Template {
+        &self.shape.template
+    }
+
+    /// Returns the body without its clothes.
+    #[must_use]
+    pub fn body(&self) -> &Template {
+        self.shape.undressed.as_ref().map_or(&self.shape.template, |(body, _)| body)
+    }
+
+    /// Returns the person's clothes.
+    pub(crate) fn outfit(&self) -> Outfit {
+        self.shape.undressed.as_ref().map_or_else(Outfit::default, |(_, outfit)| *outfit)
+    }
+
+    /// Returns the tracking quality.
+    #[must_use]
+    pub fn watch(&self) -> &TrackWatch {
+        &self.track.watch
+    }
+
+    /// Returns the pose of the last update.
+    #[must_use]
+    pub fn pose(&self) -> Option<&Pose> {
+        self.track.last_pose.as_ref()
+    }
+
+    /// Returns the confidence in the last observed pose, 0..=1.
+    #[must_use]
+    pub fn confidence(&self) -> f64 {
+        self.track.confidence
+    }
+
+    /// Returns the canonical translations of the deformation graph's nodes, metres; empty without a deformation.
+    #[must_use]
+    pub fn node_translations(&self) -> &[DVec3] {
+        self.geometry.node_translations()
+    }
+
+    /// Returns the Gaussians as they are drawn.
+    pub(crate) fn gaussians(&self) -> &GaussianBuffers {
+        self.geometry.gaussians()
+    }
+
+    /// Keeps what each view observes from the next update on, for [`Self::observed`].
+    pub(crate) fn keep_observations(&mut self, gpu: &GpuContext) -> Result<(), FusionError> {
+        self.painter.keep_observations(gpu)
+    }
+
+    /// Returns the deformation graph as the networks see it.
+    #[must_use]
+    pub fn body_graph(&self) -> &BodyGraph {
+        &self.body_graph
+    }
+
+    /// Returns an input view of the last update, sRGB with the person's mask as alpha, in the order of [`crate::Session::viewed`].
+    #[must_use]
+    pub fn input(&self, view: usize) -> &[u8] {
+        self.inputs.images().get(view).map_or(&[], |input| &input.rgba)
+    }
+
+    /// Reads back what the last update observed. Needs [`Self::keep_observations`].
+    pub(crate) fn observed(&self, gpu: &GpuContext) -> Result<Observed, FusionError> {
+        let picture = |&i: &usize| {
+            let InputImage { size: [width, height], rgba, .. } = &self.inputs.images()[i];
+            (*width, *height, rgba.clone())
+        };
+        let (painted, gaussians) = (self.painter.painted(), self.geometry.gaussians());
+        Ok(Observed {
+            observations: self.painter.observations(gpu)?,
+            slots: painted.iter().filter_map(|&i| self.track.viewed.get(i).copied()).collect(),
+            pictures: painted.iter().map(picture).collect(),
+            center_scale: gaussians.center_scale.read(gpu)?,
+            normal: gaussians.normal.read(gpu)?,
+        })
+    }
+
+    /// Returns whether the person was met within the last updates and gets all the work at whatever level of effort.
+    pub(crate) fn is_new(&self) -> bool {
+        self.schedule.is_new()
+    }
+
+    /// Prepares for an update with images of other cameras than the last.
+    pub(crate) fn views_changed(&mut self) {
+        self.geometry.views_changed();
+    }
+
+    /// Suspends the deformation, or lets it go on.
+    pub(crate) fn hold_shape(&mut self, hold: bool) {
+        self.geometry.hold(hold);
+    }
+
+    /// Gives the next frame sets the iterations of a start.
+    pub(crate) fn restart(&mut self) {
+        self.geometry.restart();
+    }
+
+    /// Returns the fraction of the person that each view of the last update confirms, 0..=1. Empty when the body was not compared
+    /// with the images, `None` for a view that was not compared.
+    pub(crate) fn agreement(&self) -> Vec<Option<f64>> {
+        self.geometry.agreement().iter().map(|view| view.map(|view| view.fraction)).collect()
+    }
+
+    /// Returns the number of Gaussians that are compared with the images; 0 where the body is only skinned.
+    pub fn compared_gaussians(&self) -> usize {
+        self.geometry.compared_gaussians()
+    }
+
+    /// Returns the report of the deformation's last solve.
+    pub fn deform_report(&self) -> Option<&DeformReport> {
+        self.geometry.report()
+    }
+
+    /// Reads back the colours for the person stream; `None` before the first pose.
+    pub(crate) fn person_frame(
+        &self,
+        gpu: &GpuContext,
+        frame: u64,
+        capture_nanos: i64,
+    ) -> Result<Option<PersonFrame>, FusionError> {
+        let Some(pose) = self.pose() else { return Ok(None) };
+        let stamp = Stamp { person: self.id.0, frame, capture_nanos, ..Stamp::default() };
+        let motion = Motion { stamp, ..motion(pose, self.node_translations()) };
+        let template = Arc::clone(&self.shape.stream);
+        if template.template.is_avatar() {
+            return Ok(Some(PersonFrame::of_pose(template, &motion)));
+        }
+        Ok(Some(PersonFrame { template, motion, colors: self.gaussians().color.read(gpu)? }))
+    }
+
+    /// Reads back the Gaussians at the last update's time.
+    pub(crate) fn splats(&self, gpu: &GpuContext) -> Result<Vec<Splat>, FusionError> {
+        Ok(read_splats(gpu, self.geometry.gaussians())?)
+    }
+
+    /// Returns the tracked surface: world positions, metres, and normals of the template's vertices.
+    pub fn surface(&self, pose: &Pose) -> (Vec<Vec3>, Vec<Vec3>) {
+        self.geometry.surface(&self.shape.template, pose)
+    }
+}
