@@ -1,7 +1,7 @@
 //! Times anisotropic Gaussians beside isotropic ones of the same number on the built-in body, forward and backward, and prints the
 //! error to the f64 reference beside the time.
 //!
-//! `cargo run --release -p flyrig-renderer --example bench_anisotropic [COUNT...]`
+//! `cargo bench -p flyrig-renderer --bench anisotropic -- [COUNT...]`
 //!
 //! With `scenes N` in place of counts: errors of the derivatives over N small random scenes, and for ever longer needles.
 
@@ -40,7 +40,7 @@ const SETTINGS: RasterSettings = RasterSettings {
 fn main() -> Result<(), Box<dyn Error>> {
     let device = GpuContext::new(&AdapterChoice::Best)?;
     let processor = device.on_processor();
-    let arguments: Vec<String> = std::env::args().skip(1).collect();
+    let arguments: Vec<String> = std::env::args().skip(1).filter(|argument| argument != "--bench").collect();
     if let [first, count] = arguments.as_slice()
         && first == "scenes"
     {

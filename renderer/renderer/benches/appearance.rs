@@ -1,5 +1,5 @@
 //! Time of direct appearance by stage and its error against the f64 reference, in every setting:
-//! `cargo run --release -p flyrig-renderer --example bench_appearance [GAUSSIANS] [NODES] [PIXELS]`
+//! `cargo bench -p flyrig-renderer --bench appearance -- [GAUSSIANS] [NODES] [PIXELS]`
 
 #[path = "../tests/appearance_support/mod.rs"]
 mod appearance_support;
@@ -14,7 +14,8 @@ use glam::DVec4;
 const RUNS: u32 = 20;
 
 fn main() -> Result<(), Box<dyn Error>> {
-    let mut arguments = std::env::args().skip(1).map(|argument| argument.parse::<usize>());
+    let mut arguments =
+        std::env::args().skip(1).filter(|argument| argument != "--bench").map(|argument| argument.parse::<usize>());
     let mut next = |default: usize| arguments.next().unwrap_or(Ok(default));
     let (gaussians, nodes, size) = (next(115_000)?, next(1620)?, next(512)?);
     let gpu = GpuContext::new(&AdapterChoice::Best)?;

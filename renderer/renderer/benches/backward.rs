@@ -1,6 +1,6 @@
 //! Times the backward rasteriser beside the forward one on the built-in body, and prints the error beside the time.
 //!
-//! `cargo run --release -p flyrig-renderer --example bench_backward`
+//! `cargo bench -p flyrig-renderer --bench backward`
 //!
 //! The loss is the squared difference of colour and alpha to the body moved by a smooth wave of 1 cm.
 

@@ -1,6 +1,6 @@
 //! Times the rasteriser on the built-in body and prints the error beside every time.
 //!
-//! `cargo run --release -p flyrig-renderer --example bench_raster [PICTURE_FOLDER]`
+//! `cargo bench -p flyrig-renderer --bench raster -- [PICTURE_FOLDER]`
 
 #[path = "../tests/support/mod.rs"]
 mod support;
@@ -20,7 +20,7 @@ use support::{Difference, Pictures, upload};
 const RUNS: usize = 15;
 
 fn main() -> Result<(), Box<dyn Error>> {
-    let folder = std::env::args().nth(1).map(PathBuf::from);
+    let folder = std::env::args().skip(1).find(|argument| argument != "--bench").map(PathBuf::from);
     let device = GpuContext::new(&AdapterChoice::Best)?;
     let processor = device.on_processor();
     let commit = Command::new("git").args(["rev-parse", "--short", "HEAD"]).output().ok();

@@ -1,6 +1,6 @@
 //! Compares a frame that waits for the GPU after each stage with one that waits only when it reads the result back.
 //!
-//! `cargo run --release -p flyrig-renderer --example bench_waits [GAUSSIANS] [SIDE]`
+//! `cargo bench -p flyrig-renderer --bench waits -- [GAUSSIANS] [SIDE]`
 
 use std::error::Error;
 use std::time::{Duration, Instant};
@@ -40,7 +40,7 @@ fn camera(azimuth: f64, side: u32) -> Camera {
 }
 
 fn main() -> Result<(), Box<dyn Error>> {
-    let mut arguments = std::env::args().skip(1);
+    let mut arguments = std::env::args().skip(1).filter(|argument| argument != "--bench");
     let count: usize = arguments.next().map_or(Ok(57_000), |text| text.parse())?;
     let side: u32 = arguments.next().map_or(Ok(512), |text| text.parse())?;
     let gpu = GpuContext::new(&AdapterChoice::Best)?;

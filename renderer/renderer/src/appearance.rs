@@ -32,13 +32,10 @@
 //! - **No spatial aggregation**: the paper's baseline. A camera that has the point inside image and mask gets a
 //!   small extra weight, visible or not; the weights are normalised. Points inside no image are grey.
 
+pub(crate) mod color_means;
 mod graph_buffers;
-mod hierarchy;
+pub(crate) mod hierarchy;
 mod kernels;
 mod processor;
-mod settings;
-mod update;
-
-pub use hierarchy::{DiffusionHierarchy, DiffusionLevel};
-pub use settings::{AppearanceError, AppearanceSettings, ObservationBuffers, Observations, ViewInput};
-pub use update::DirectAppearance;
+pub(crate) mod settings;
+pub(crate) mod update;

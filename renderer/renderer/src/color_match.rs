@@ -3,7 +3,7 @@
 use flyrig_types::{Camera, ColorMatch};
 use glam::DVec2;
 
-use crate::srgb_from_linear;
+use crate::color::srgb_from_linear;
 
 /// Entries of the table from light to bytes: steps of at most a quarter of a byte, in the shadows.
 const CODES: usize = 1 << 14;

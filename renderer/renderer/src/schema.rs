@@ -5,7 +5,7 @@
 
 use flyrig_gpu::{GpuContext, GpuError, StorageBuffer};
 
-use crate::HarmonicOrder;
+use crate::anisotropic::order::HarmonicOrder;
 
 /// Element of every attribute's buffer.
 pub type GaussianElement = [f32; 4];

@@ -9,8 +9,8 @@ use flyrig_types::Camera;
 use glam::{DVec2, DVec3};
 use rayon::prelude::*;
 
-use crate::RasterSettings;
-use crate::raster_kernels::{BACKFACING_COSINE, CUT, MAX_ALPHA, OPAQUE};
+use crate::raster::kernels::{BACKFACING_COSINE, CUT, MAX_ALPHA, OPAQUE};
+use crate::raster::settings::RasterSettings;
 
 /// Side of the squares in which wanted pixels are looked up.
 const CELL_PX: u32 = 8;

@@ -3,8 +3,9 @@
 use flyrig_gpu::{ComputeKernel, GpuContext, GpuError, StorageBuffer, dispatch_1d};
 use wgpu::{CommandEncoder, ComputePassDescriptor};
 
-use crate::scan::run;
-use crate::{RenderTarget, rgba8_from_target};
+use crate::buffers::RenderTarget;
+use crate::color::rgba8_from_target;
+use crate::sort::scan::run;
 
 pub(crate) const WGSL: &str = include_str!("view_bytes.wgsl");
 

@@ -3,7 +3,11 @@
 use flyrig_gpu::{GpuContext, GpuError};
 use flyrig_types::{Camera, RenderedView};
 
-use crate::{Gaussians, Outputs, RasterSettings, Rasterizer, RenderTarget, ViewBytes};
+use crate::anisotropic::buffers::Gaussians;
+use crate::buffers::RenderTarget;
+use crate::raster::rasterizer::Rasterizer;
+use crate::raster::settings::{Outputs, RasterSettings};
+use crate::view_bytes::ViewBytes;
 
 /// Draws views of one scene after the other; buffers are made once and grow with the image and the number of Gaussians.
 #[derive(Debug)]

@@ -35,7 +35,4 @@ pub enum StfaError {
     /// A frame's inputs of different lengths.
     #[error("learned appearance cannot use this frame: {0}")]
     Frame(String),
-    /// The networks' library and the graphics device do not get on.
-    #[error("the networks cannot use the graphics adapter: {0}; let them run on the processor")]
-    Device(String),
 }

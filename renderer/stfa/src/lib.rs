@@ -17,18 +17,13 @@
 mod body_graph;
 mod comparison;
 mod crops;
-#[cfg(any(test, feature = "wgpu"))]
-mod device_paint;
 mod error;
 mod inputs;
 mod memory;
 mod network;
-mod network_device;
 mod paint;
 mod parameters;
 mod sample;
-#[cfg_attr(not(feature = "wgpu"), path = "shared_missing.rs")]
-mod shared;
 mod structure;
 mod taps;
 mod tensor_file;
@@ -42,11 +37,9 @@ pub use crops::{Crops, DETAIL, ViewImage};
 pub use error::StfaError;
 pub use inputs::{CANDIDATES, FrameInputs, NODE, STATE, frame_inputs};
 pub use memory::FeatureMemory;
-pub use network_device::NetworkDevice;
 pub use paint::{LearnedAppearance, PaintCounts};
 pub use parameters::{NetworkSize, Parameters};
 pub use sample::{PATCH, SHARES, Target, TargetImage, TrainingSample, training_sample};
-pub use shared::SharedAppearance;
 pub use taps::{FeatureMaps, Tap, Taps};
 pub use train::{Loss, TrainSettings, Trainer};
 pub use weights::{EMBEDDED, WEIGHTS_VERSION};

@@ -8,7 +8,7 @@ use std::{collections::BTreeMap, path::Path};
 
 use flyrig_learn::{
     AdamStep, Moments,
-    burn_tensor::{Tensor, TensorData},
+    burn_tensor::{Device, Tensor, TensorData},
     to_vec,
 };
 use rand::{RngExt as _, SeedableRng as _, rngs::SmallRng, seq::SliceRandom as _};
@@ -16,7 +16,7 @@ use safetensors::SafeTensors;
 use serde::{Deserialize, Serialize};
 
 use crate::{
-    NetworkDevice, Parameters, StfaError,
+    Parameters, StfaError,
     comparison::{Comparison, PixelLoss, planes},
     network::{Network, feature_maps},
     sample::{Target, TrainingSample},
@@ -90,8 +90,6 @@ pub struct Trainer {
     pub settings: TrainSettings,
     /// Steps done.
     pub step: u64,
-    /// Where.
-    pub device: NetworkDevice,
     /// Mean and mean square of each gradient.
     moments: BTreeMap<String, Moments>,
 }
@@ -102,7 +100,7 @@ impl Trainer {
     pub fn new(parameters: Parameters, settings: TrainSettings) -> Self {
         let zeros = |count: usize| [vec![0.0; count], vec![0.0; count]];
         let moments = parameters.by_name.iter().map(|(name, p)| (name.clone(), zeros(p.values.len()))).collect();
-        Self { parameters, settings, step: 0, device: NetworkDevice::processor(), moments }
+        Self { parameters, settings, step: 0, moments }
     }
 
     /// Place of the sample that the next step wants, out of `count`: every sample once a round, in random order.
@@ -144,7 +142,7 @@ impl Trainer {
         target: &Target,
         variation: Variation,
     ) -> Option<(PixelLoss, BTreeMap<String, Vec<f32>>)> {
-        let device = self.device.0.clone().autodiff();
+        let device = Device::flex().autodiff();
         let tensors = self.parameters.tensors(&device, true);
         let network = Network { device, size: self.parameters.size, tensors };
         let levels = network.encode(planes(&network, sample, variation));
@@ -242,7 +240,7 @@ impl Trainer {
             let get = |what: &str| array(&file, &format!("{what}.{name}"), &shape).map_err(refuse);
             moments.insert(name.clone(), [get("mean")?, get("square")?]);
         }
-        Ok(Self { parameters, settings, step, device: NetworkDevice::processor(), moments })
+        Ok(Self { parameters, settings, step, moments })
     }
 }
 

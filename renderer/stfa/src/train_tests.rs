@@ -239,18 +239,3 @@ fn damaged_weights_are_named() {
     // The settings that samples are gathered with are those of direct appearance.
     AppearanceSettings::default().validate().unwrap();
 }
-
-#[cfg(feature = "wgpu")]
-#[test]
-fn steps_on_the_graphics_device_are_those_of_the_processor() {
-    let gpu = flyrig_gpu::GpuContext::new(&flyrig_gpu::AdapterChoice::Best).unwrap();
-    let samples = [sample(1), sample(3)];
-    let mut plain = Trainer::new(Parameters::untrained(SIZE, 1), settings(10));
-    let mut other = plain.clone();
-    other.device = NetworkDevice::adapter(&gpu).unwrap();
-    for step in 0..3 {
-        let [a, b] = [&mut plain, &mut other].map(|trainer| trainer.step(&samples[step % 2]).unwrap());
-        assert!((a.mse - b.mse).abs() < 1e-3 * a.mse, "step {step}: {a:?} against {b:?}");
-    }
-    assert!(plain.parameters.by_name != Parameters::untrained(SIZE, 1).by_name);
-}

@@ -55,8 +55,8 @@ pub use rig_watch::{Correction, RigWatch, WatchEvent};
 pub use session::{Counts, Outcome, Session, SessionBuilder};
 pub use set_reader::{SetReader, next_frame};
 pub use settings::{
-    AppearanceMode, AppearanceOptions, BodySettings, BudgetSettings, NetworksOn, Origin, PerceptionSettings,
-    SessionSettings, Solver, TrackingSettings,
+    AppearanceMode, AppearanceOptions, BodySettings, BudgetSettings, Origin, PerceptionSettings, SessionSettings,
+    Solver, TrackingSettings,
 };
 pub use stage_times::{StageSummary, StageTimes, processor_time, resident_mib};
 pub use stage_trace::{TracedStage, start_stage_trace, take_stage_trace};

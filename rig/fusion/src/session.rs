@@ -7,7 +7,7 @@ use flyrig_renderer::{GaussianBuffers, Splat};
 use flyrig_types::{Camera, Frame, FrameSet, Image, PersonId, Pose, RenderedView, Rig};
 
 use crate::{
-    Budget, Effort, FusionError, NetworksOn, Observation, Perception, PersonFrame, PersonMemory, Remedy, SeenPerson,
+    Budget, Effort, FusionError, Observation, Perception, PersonFrame, PersonMemory, Remedy, SeenPerson,
     SessionSettings, StageTimes, Subject, ViewObservation,
     drawing::Drawing,
     newcomers::Newcomers,
@@ -81,7 +81,7 @@ impl SessionBuilder {
     /// [`FusionError`] names the setting, template or saved person that cannot be used, or what the GPU refuses.
     pub fn build(self) -> Result<Session, FusionError> {
         self.settings.validate()?;
-        let gpu = place_kernels(&self.gpu, &self.settings);
+        let gpu = self.gpu.fastest();
         let mut session = Session {
             drawing: Drawing::new(&gpu, self.settings.body.gaussians)?,
             gpu,
@@ -102,13 +102,6 @@ impl SessionBuilder {
         session.add_people(people)?;
         Ok(session)
     }
-}
-
-/// The context of a session's kernels. Networks on the adapter need the colours there.
-fn place_kernels(gpu: &GpuContext, settings: &SessionSettings) -> GpuContext {
-    let networks_on_adapter =
-        settings.appearance.mode.is_learned() && settings.appearance.networks_on == NetworksOn::Adapter;
-    if networks_on_adapter { gpu.clone() } else { gpu.fastest() }
 }
 
 /// The live reconstruction of any number of people from one rig.
@@ -483,7 +476,7 @@ impl Session {
         gpu: &GpuContext,
         memories: &BTreeMap<PersonId, PersonMemory>,
     ) -> Result<(), FusionError> {
-        let gpu = place_kernels(gpu, &self.settings);
+        let gpu = gpu.fastest();
         let drawing = Drawing::new(&gpu, self.settings.body.gaussians)?;
         let mut subjects = Vec::new();
         for old in &self.subjects {

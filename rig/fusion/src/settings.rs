@@ -6,7 +6,7 @@ mod budget;
 mod perception;
 mod tracking;
 
-pub use appearance::{AppearanceMode, AppearanceOptions, NetworksOn};
+pub use appearance::{AppearanceMode, AppearanceOptions};
 pub use body::BodySettings;
 pub use budget::BudgetSettings;
 pub use perception::{Origin, PerceptionSettings};
@@ -38,8 +38,7 @@ impl SessionSettings {
         self.perception.validate()?;
         self.body.validate()?;
         self.tracking.validate()?;
-        self.budget.validate()?;
-        self.appearance.validate()
+        self.budget.validate()
     }
 }
 

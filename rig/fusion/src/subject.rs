@@ -12,13 +12,13 @@ use flyrig_renderer::{
     AppearanceSettings, ColorMatcher, DirectAppearance, GaussianBuffers, Observations, Outputs, RasterSettings,
     Rasterizer, RenderTarget, Splat, UNKNOWN_RGBA, ViewInput, read_splats,
 };
-use flyrig_stfa::{BodyGraph, LearnedAppearance, Parameters, SharedAppearance, ViewImage};
+use flyrig_stfa::{BodyGraph, LearnedAppearance, Parameters, ViewImage};
 use flyrig_stream::EncodedTemplate;
 use flyrig_tracker::{DeformReport, EdgeColor};
 use flyrig_types::{Camera, Image, Mask, PersonId, Pose, Rig};
 
 use crate::{
-    BodySettings, Effort, FusionError, NetworksOn, PersonMemory, SessionSettings, StageTimes, TrackWatch,
+    BodySettings, Effort, FusionError, PersonMemory, SessionSettings, StageTimes, TrackWatch,
     deformation::{DeformTimes, Deformation, Instants, TrackedView},
     memory::NetworkMemory,
     person_stream::encode_template,
@@ -78,13 +78,6 @@ pub struct Observed {
     pub normal: Vec<[f32; 4]>,
 }
 
-/// The networks, by device.
-#[derive(Debug)]
-enum Networks {
-    Processor(Box<LearnedAppearance>),
-    Adapter(SharedAppearance),
-}
-
 /// One person as Gaussians on the GPU, with everything that belongs to the person: shape, pose track, deformation, colour
 /// memory and tracking quality.
 #[derive(Debug)]
@@ -105,7 +98,7 @@ pub struct Subject {
     appearance: DirectAppearance,
     settings: AppearanceSettings,
     body: BodyGraph,
-    networks: Option<Networks>,
+    networks: Option<Box<LearnedAppearance>>,
     /// Of [`TIMED_STAGES`].
     timer: StageTimer,
     /// Views that painted in the last update.
@@ -171,7 +164,7 @@ impl Subject {
         let mut subject = Self::from_parts(gpu, id, template, &surface, &graph, rig, settings)?;
         subject.undressed = (!outfit.is_bare()).then_some((shape, outfit));
         if let Some(networks) = settings.appearance.load_networks()? {
-            subject.use_networks(gpu, &networks, settings)?;
+            subject.use_networks(gpu, &networks)?;
         }
         Ok(subject)
     }
@@ -290,21 +283,9 @@ impl Subject {
         &self.gaussians
     }
 
-    fn use_networks(
-        &mut self,
-        gpu: &GpuContext,
-        parameters: &Parameters,
-        settings: &SessionSettings,
-    ) -> Result<(), FusionError> {
+    fn use_networks(&mut self, gpu: &GpuContext, parameters: &Parameters) -> Result<(), FusionError> {
         self.appearance.keep_observations(gpu)?;
-        self.networks = Some(match settings.appearance.networks_on {
-            NetworksOn::Processor => {
-                let mut learned = LearnedAppearance::new(parameters, self.body.clone());
-                learned.reuse = settings.appearance.reuse;
-                Networks::Processor(Box::new(learned))
-            }
-            NetworksOn::Adapter => Networks::Adapter(SharedAppearance::new(gpu, parameters, &self.body)?),
-        });
+        self.networks = Some(Box::new(LearnedAppearance::new(parameters, self.body.clone())));
         let direct = StorageBuffer::zeroed(gpu, "direct colours", self.gaussians.count())?;
         self.gaussians.color.copy_to(gpu, &direct);
         self.direct_colors = Some(direct);
@@ -537,7 +518,7 @@ impl Subject {
 
     /// Lets the networks add to what direct appearance painted.
     fn paint_learned(&mut self, gpu: &GpuContext, stages: &mut StageTimes) -> Result<(), FusionError> {
-        let Some(networks) = &mut self.networks else { return Ok(()) };
+        let Some(learned) = &mut self.networks else { return Ok(()) };
         let start = Instant::now();
         if let Some(direct) = &self.direct_colors {
             self.gaussians.color.copy_to(gpu, direct);
@@ -547,23 +528,12 @@ impl Subject {
             ViewImage { width: *width, height: *height, rgba }
         };
         let pictures: Vec<_> = self.painted.iter().map(picture).collect();
-        let learned = match networks {
-            Networks::Processor(learned) => learned,
-            Networks::Adapter(learned) => {
-                learned.paint(gpu, &self.appearance, &self.gaussians, &pictures, &self.settings)?;
-                gpu.wait()?;
-                stages.add("networks", start.elapsed());
-                return Ok(());
-            }
-        };
         let observed = self.appearance.observations(gpu, self.painted.len())?;
         let before = learned.counts;
         let colors = learned.paint(&observed, &pictures, &self.settings)?;
         self.gaussians.color.write(gpu, &colors);
         stages.add("networks", start.elapsed());
         let counts = learned.counts;
-        stages.count("views not encoded", counts.views_kept - before.views_kept);
-        stages.count("Gaussian corrections used again", counts.colors_kept - before.colors_kept);
         stages.count("corrections that were no numbers", counts.poisoned - before.poisoned);
         Ok(())
     }
@@ -575,10 +545,8 @@ impl Subject {
             deformation.reset();
         }
         self.appearance.reset();
-        match &mut self.networks {
-            Some(Networks::Processor(learned)) => learned.reset(),
-            Some(Networks::Adapter(learned)) => learned.reset(),
-            None => {}
+        if let Some(learned) = &mut self.networks {
+            learned.reset();
         }
         match self.start.clone() {
             Some(start) => self.show(gpu, &start),
@@ -591,10 +559,9 @@ impl Subject {
         let translations = self.deformation.as_ref().map_or_else(Vec::new, |known| known.translations().to_vec());
         let colors = self.direct_colors.as_ref().unwrap_or(&self.gaussians.color);
         let networks = match &self.networks {
-            Some(Networks::Processor(learned)) if !learned.memory().weights().is_empty() => {
+            Some(learned) if !learned.memory().weights().is_empty() => {
                 Some(NetworkMemory { digest: learned.digest(), memory: learned.memory().clone() })
             }
-            // Those on the adapter begin anew.
             _ => None,
         };
         let (memory, colors) = (self.appearance.memory(gpu)?, colors.read(gpu)?);
@@ -619,7 +586,7 @@ impl Subject {
         if memory.is_start {
             self.start_from(Arc::new(memory.clone()));
         }
-        if let (Some(Networks::Processor(learned)), Some(of)) = (&mut self.networks, &memory.networks)
+        if let (Some(learned), Some(of)) = (&mut self.networks, &memory.networks)
             && learned.digest() == of.digest
         {
             learned.restore(of.memory.clone());
@@ -656,7 +623,7 @@ impl Subject {
         Ok(())
     }
 
-    /// Takes over what belongs to no device: poses, tracking quality, and the memory of networks on the processor. For the same person on another device.
+    /// Takes over what belongs to no device: poses, tracking quality, and the memory of networks. For the same person on another device.
     pub(crate) fn take_over(&mut self, old: &Self) {
         let resumed = self.watch.is_resumed();
         self.curve.clone_from(&old.curve);
@@ -668,10 +635,7 @@ impl Subject {
         (self.confidence, self.shape_held, self.shape) = (old.confidence, old.shape_held, old.shape);
         if resumed {
             self.watch.clone_from(&old.watch);
-            // Those on the adapter went with the device.
-            if let (Some(Networks::Processor(networks)), Some(Networks::Processor(old))) =
-                (&mut self.networks, &old.networks)
-            {
+            if let (Some(networks), Some(old)) = (&mut self.networks, &old.networks) {
                 networks.restore(old.memory().clone());
             }
         }

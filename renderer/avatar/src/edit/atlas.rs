@@ -5,7 +5,8 @@ use flyrig_renderer::{SH_DEGREE_0, linear_from_srgb, srgb_from_linear};
 use glam::{Vec2, Vec3};
 use rayon::prelude::*;
 
-use crate::{Attachment, Avatar, AvatarError};
+use crate::error::AvatarError;
+use crate::model::avatar::{Attachment, Avatar};
 
 /// Texels along a side: about 2 mm each on an adult.
 pub const DEFAULT_ATLAS_SIDE: u32 = 1024;
@@ -242,7 +243,7 @@ pub(crate) fn decode(rgb: &[u8]) -> Vec3 {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::avatar::tests::small;
+    use crate::model::avatar::tests::small;
 
     /// A plain, slow reference: every Gaussian for every texel, in f64.
     #[test]

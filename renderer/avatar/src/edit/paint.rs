@@ -7,10 +7,9 @@ use flyrig_body::{PointGrid, SkinWeights, Template};
 use flyrig_renderer::SH_DEGREE_0;
 use glam::{Quat, Vec3};
 
-use crate::{
-    Atlas, Attachment, Avatar, AvatarError,
-    atlas::{KERNEL, Shown, Texel, decode},
-};
+use crate::edit::atlas::{Atlas, KERNEL, Shown, Texel, decode};
+use crate::error::AvatarError;
+use crate::model::avatar::{Attachment, Avatar};
 
 /// Texels within so many deviations of a Gaussian belong to it.
 const REACH: f32 = 1.5;
@@ -225,7 +224,7 @@ fn blended_skin(template: &Template, attachment: &Attachment) -> Option<SkinWeig
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::avatar::tests::small;
+    use crate::model::avatar::tests::small;
 
     #[test]
     fn an_untouched_texture_changes_nothing() {

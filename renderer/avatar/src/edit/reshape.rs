@@ -3,7 +3,8 @@
 use flyrig_body::{PointGrid, ShapeParams, Template};
 use glam::{Mat3, Quat, Vec3};
 
-use crate::{Attachment, Avatar, AvatarError};
+use crate::error::AvatarError;
+use crate::model::avatar::{Attachment, Avatar};
 
 /// The nodes of the graph lie on the surface; their vertex is looked for within this distance, metres, then twice it, and so on.
 const NEAR_M: f32 = 0.02;
@@ -80,7 +81,7 @@ mod tests {
     use flyrig_body::{default_template, sample_surface};
 
     use super::*;
-    use crate::avatar::tests::small;
+    use crate::model::avatar::tests::small;
 
     #[test]
     fn gaussians_lie_where_those_of_the_other_shape_would() {

@@ -5,7 +5,7 @@
 
 use rayon::prelude::*;
 
-use crate::parameters::Element;
+use crate::model::parameters::Element;
 
 const BETA_1: f32 = 0.9;
 const BETA_2: f32 = 0.999;

@@ -5,7 +5,9 @@ use std::collections::HashMap;
 use safetensors::{Dtype, SafeTensors, tensor::TensorView};
 use serde::{Deserialize, Serialize};
 
-use crate::{Avatar, AvatarError, Fit, rest::Rest};
+use crate::error::AvatarError;
+use crate::fit::descent::Fit;
+use crate::model::avatar::Avatar;
 
 /// Key of the description in the file's metadata.
 const HEADER: &str = "flyrig-fit";
@@ -19,8 +21,6 @@ pub struct FitProgress {
     pub done: u64,
     /// Steps in all.
     pub total: u64,
-    /// Images that were drawn or left out.
-    turn: u64,
 }
 
 impl Fit {
@@ -30,7 +30,7 @@ impl Fit {
     /// [`AvatarError::Format`] for a description that cannot be written.
     pub fn checkpoint(&mut self, avatar: &mut Avatar, settings: &str, total: u64) -> Result<Vec<u8>, AvatarError> {
         let fail = |problem: String| AvatarError::Format { path: "checkpoint".into(), problem };
-        let progress = FitProgress { settings: settings.to_owned(), done: self.step, total, turn: self.turn };
+        let progress = FitProgress { settings: settings.to_owned(), done: self.step, total };
         let header = serde_json::to_string(&progress).map_err(|error| fail(error.to_string()))?;
         let state = self.state(avatar);
         let views: Vec<_> = state
@@ -63,26 +63,18 @@ impl Fit {
             let values: Vec<f32> = tensor.data().chunks_exact(4).map(bytemuck::pod_read_unaligned).collect();
             found.insert(name.to_owned(), values);
         }
-        let images = self.images().max(1) as u64;
         let state = self.state(avatar);
         for (name, own) in &state {
             let belongs =
                 |values: &&Vec<f32>| values.len() == own.len() && values.iter().all(|value| value.is_finite());
             found.get(name).filter(belongs).ok_or_else(|| format!("is damaged: {name} is missing or another"))?;
         }
-        let round = progress.turn / images;
-        // No image rests for longer than three rounds.
-        let turns = progress.done..=5 * progress.done.min(u64::MAX / 8).saturating_add(images);
-        let until = found.get("rest.until");
-        if !turns.contains(&progress.turn) || !until.is_some_and(|until| Rest::is_possible(until, round)) {
-            return Err("is damaged: its rounds are impossible".to_owned());
-        }
         for (name, own) in state {
             if let Some(values) = found.get(&name) {
                 own.copy_from_slice(values);
             }
         }
-        (self.step, self.turn) = (progress.done, progress.turn);
+        self.step = progress.done;
         if let Some(skin) = &self.skin {
             skin.bake(&mut avatar.skin);
         }
@@ -117,8 +109,6 @@ impl Fit {
                 all.push((format!("adam.{k}.{number}"), list.as_flattened_mut()));
             }
         }
-        all.push(("rest.errors".to_owned(), self.rest.errors.as_mut_slice()));
-        all.push(("rest.until".to_owned(), self.rest.until.as_mut_slice()));
         all.extend(self.local.iter_mut().flat_map(|local| local.state()));
         all
     }

@@ -1,9 +1,6 @@
 //! Gradient descent on the images of a take.
 
-use std::{
-    collections::{BTreeMap, btree_map::Entry},
-    ops::Range,
-};
+use std::collections::{BTreeMap, btree_map::Entry};
 
 use flyrig_gpu::{GpuContext, read_all};
 use flyrig_renderer::{
@@ -14,18 +11,19 @@ use flyrig_types::Pose;
 use glam::{DVec3, Vec2};
 use rand::{SeedableRng as _, rngs::StdRng, seq::SliceRandom as _};
 
-use crate::{
-    Avatar, AvatarError, Bones, ErrorWeights, ImageError, LocalSettings, PosedAvatar, TrainingView,
-    adam::Adam,
-    light::LightFit,
-    local::Local,
-    neighbors::Neighbors,
-    parameters::Element,
-    pose_fit::PoseFit,
-    rest::{Drawn, Rest},
-    scene::AvatarBuffers,
-    skin_fit::SkinFit,
-};
+use crate::error::AvatarError;
+use crate::fit::adam::Adam;
+use crate::fit::image_error::{ErrorWeights, ImageDifference};
+use crate::fit::pose_fit::PoseFit;
+use crate::fit::skin_fit::SkinFit;
+use crate::fit::training_view::TrainingView;
+use crate::local::networks::{Local, LocalSettings};
+use crate::model::avatar::Avatar;
+use crate::model::light::LightFit;
+use crate::model::neighbors::Neighbors;
+use crate::model::parameters::Element;
+use crate::model::posing::{Bones, PosedAvatar};
+use crate::model::scene::AvatarBuffers;
 
 /// Differences to neighbours of the lists' columns at which their pull is as strong as images usually are. Rotations do not pull: a
 /// quaternion and its negative are the same.
@@ -33,9 +31,6 @@ const DIFFERENCES: [Element; 4] =
     [[5e-3, 5e-3, 5e-3, f32::INFINITY], [0.7, 0.7, 0.7, 1.0], [f32::INFINITY; 4], [0.7, 0.7, 0.7, f32::INFINITY]];
 /// Colours of higher orders than zero move more slowly.
 const HIGHER: f32 = 0.05;
-
-/// Buffers of so many sizes are kept for images that are drawn in part, beside those of whole ones.
-const PARTIAL_SIZES: usize = 8;
 
 /// Keeps the rounds of one seed apart from those of the next ones.
 const ROUND_SEED: u64 = 0x9e37_79b9_7f4a_7c15;
@@ -66,8 +61,6 @@ pub struct FitSettings {
     pub refine_poses: bool,
     /// Whether the skin weights are corrected.
     pub skin_correction: bool,
-    /// Whether parts of images whose error does not change any more are drawn less often.
-    pub rest: bool,
 }
 
 impl Default for FitSettings {
@@ -84,7 +77,6 @@ impl Default for FitSettings {
             light: true,
             refine_poses: false,
             skin_correction: false,
-            rest: false,
         }
     }
 }
@@ -144,9 +136,6 @@ pub struct Fit {
     /// Networks whose outputs the lists are; None where the lists themselves are learnt.
     pub(crate) local: Option<Local>,
     pub(crate) step: u64,
-    /// Views that were drawn or left out, and parts of them that rest.
-    pub(crate) turn: u64,
-    pub(crate) rest: Rest,
     /// Views in the order of a round, and its number.
     round: (Vec<usize>, u64),
 }
@@ -191,8 +180,6 @@ impl Fit {
             neighbors: Neighbors::new(&avatar.places),
             local: None,
             step: 0,
-            turn: 0,
-            rest: Rest::new(views.iter().map(|view| view.size()[1]), settings.rest),
             round: (Vec::new(), 0),
             settings,
             frames,
@@ -237,12 +224,10 @@ impl Fit {
     /// # Errors
     /// [`AvatarError::Gpu`], [`AvatarError::Backward`].
     pub fn step(&mut self, avatar: &mut Avatar, progress: f32) -> Result<StepReport, AvatarError> {
-        let (index, rows, round) = self.next_view();
-        let (error, bones) = self.draw(avatar, index, &rows)?;
+        let index = self.next_view();
+        let (error, bones) = self.draw(avatar, index)?;
         let view = &self.views[index];
-        let width = view.size()[0];
-        self.rest.judge(index, round, rows.start, &error.pixels, width as usize);
-        let Some(Targets { drawn, slopes }) = self.targets.get(&[width, rows.end - rows.start]) else {
+        let Some(Targets { drawn, slopes }) = self.targets.get(&view.size()) else {
             return Err(AvatarError::Images("an image has no target".to_owned()));
         };
         slopes.color.write(&self.gpu, &error.slope);
@@ -302,30 +287,18 @@ impl Fit {
         Ok(StepReport { loss: error.loss, decibels: -10.0 * error.squared.max(1e-10).log10() })
     }
 
-    /// The view of this step, its rows that are drawn, and the round. Rounds are shuffled by their number, so that a fit that goes on from a
-    /// checkpoint sees the same ones.
-    fn next_view(&mut self) -> (usize, Range<u32>, u64) {
+    /// Returns the view of the next step. Rounds are shuffled by their number, so that a fit that resumes from a checkpoint sees the same
+    /// views.
+    fn next_view(&mut self) -> usize {
         let count = self.views.len().max(1) as u64;
-        loop {
-            let (number, at) = (self.turn / count, (self.turn % count) as usize);
-            if self.round.0.is_empty() || self.round.1 != number {
-                let mut order: Vec<usize> = (0..self.views.len()).collect();
-                let seed = self.settings.seed.wrapping_add(number.wrapping_mul(ROUND_SEED));
-                order.shuffle(&mut StdRng::seed_from_u64(seed));
-                self.round = (order, number);
-            }
-            self.turn += 1;
-            let view = self.round.0[at];
-            if let Some(rows) = self.rest.rows(view, number) {
-                return (view, rows, number);
-            }
+        let (number, at) = (self.step / count, (self.step % count) as usize);
+        if self.round.0.is_empty() || self.round.1 != number {
+            let mut order: Vec<usize> = (0..self.views.len()).collect();
+            let seed = self.settings.seed.wrapping_add(number.wrapping_mul(ROUND_SEED));
+            order.shuffle(&mut StdRng::seed_from_u64(seed));
+            self.round = (order, number);
         }
-    }
-
-    /// Returns how much of the images was drawn by the steps since the fit was made.
-    #[must_use]
-    pub fn drawn(&self) -> Drawn {
-        self.rest.drawn
+        self.round.0[at]
     }
 
     /// Mean PSNR over all images as the avatar is now, decibels of the mean squared error.
@@ -335,8 +308,7 @@ impl Fit {
     pub fn decibels(&mut self, avatar: &Avatar) -> Result<f64, AvatarError> {
         let mut sum = 0.0;
         for view in 0..self.views.len() {
-            let rows = 0..self.views[view].size()[1];
-            sum += self.draw(avatar, view, &rows)?.0.squared;
+            sum += self.draw(avatar, view)?.0.squared;
         }
         Ok(-10.0 * (sum / self.views.len().max(1) as f64).max(1e-10).log10())
     }
@@ -354,8 +326,8 @@ impl Fit {
         ]
     }
 
-    /// Draws some rows of a view and compares them with its image. Returns the bones as well.
-    fn draw(&mut self, avatar: &Avatar, view: usize, rows: &Range<u32>) -> Result<(ImageError, Bones), AvatarError> {
+    /// Renders a view and compares it with its image. Returns the bones as well.
+    fn draw(&mut self, avatar: &Avatar, view: usize) -> Result<(ImageDifference, Bones), AvatarError> {
         let view = &self.views[view];
         let frame = &self.frames[view.frame];
         let pose = self.pose(view.frame).unwrap_or_else(|| frame.pose.clone());
@@ -363,14 +335,7 @@ impl Fit {
         let translations = (!frame.translations.is_empty()).then_some(frame.translations.as_slice());
         avatar.pose(&bones, translations, &mut self.posed);
         self.buffers.pose(&self.gpu, &self.posed);
-        let (camera, wanted) = view.rows(rows);
-        let size = [camera.intrinsics.width, camera.intrinsics.height];
-        if !self.targets.contains_key(&size) {
-            let is_whole = |size: &[u32; 2]| self.views.iter().any(|view| view.size() == *size);
-            if self.targets.keys().filter(|size| !is_whole(size)).count() >= PARTIAL_SIZES {
-                self.targets.retain(|size, _| is_whole(size));
-            }
-        }
+        let size = view.size();
         let Targets { drawn, .. } = match self.targets.entry(size) {
             Entry::Occupied(entry) => entry.into_mut(),
             Entry::Vacant(entry) => entry.insert(Targets::new(&self.gpu, size)?),
@@ -378,18 +343,11 @@ impl Fit {
         let settings =
             RasterSettings { outputs: Outputs { canonical: false, ..Outputs::ALL }, ..RasterSettings::default() };
         let mut encoder = self.gpu.device.create_command_encoder(&Default::default());
-        self.rasterizer.encode(&self.gpu, &mut encoder, &self.buffers.gaussians, &camera, &settings, drawn)?;
+        self.rasterizer.encode(&self.gpu, &mut encoder, &self.buffers.gaussians, &view.camera, &settings, drawn)?;
         self.gpu.queue.submit([encoder.finish()]);
         let pixels = drawn.color.read(&self.gpu)?;
-        let mut error = ImageError::of(&pixels, wanted, size[0] as usize, &self.settings.weights);
-        // A pixel counts as much as in the whole image.
-        let whole = 0..view.size()[1];
-        if *rows != whole {
-            let share = view.person(rows).max(1.0) / view.person(&whole).max(1.0);
-            error.loss *= share;
-            error.slope.iter_mut().flatten().for_each(|slope| *slope *= share as f32);
-        }
-        Ok((error, bones))
+        let difference = ImageDifference::of(&pixels, view.photograph(), size[0] as usize, &self.settings.weights);
+        Ok((difference, bones))
     }
 }
 

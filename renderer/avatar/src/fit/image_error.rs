@@ -7,7 +7,7 @@
 use flyrig_renderer::srgb_from_linear;
 use rayon::prelude::*;
 
-use crate::ssim::{Blur, ssim};
+use crate::fit::ssim::{Blur, ssim};
 
 /// Coverage below which a pixel has no colour.
 const CLEAR: f32 = 1.0 / 512.0;
@@ -38,13 +38,11 @@ impl Default for ErrorWeights {
 
 /// Error of one image.
 #[derive(Debug, Clone, PartialEq, Default)]
-pub struct ImageError {
+pub struct ImageDifference {
     /// The weighted error, a mean over the pixels of the person.
     pub loss: f64,
     /// Mean squared difference of sRGB over all pixels that are compared, codes of 0..=1.
     pub squared: f64,
-    /// The same of each pixel, 0 where it is not compared.
-    pub pixels: Vec<f32>,
     /// Derivative with respect to premultiplied linear red, green, blue, and coverage; an element a pixel.
     pub slope: Vec<[f32; 4]>,
 }
@@ -107,7 +105,7 @@ pub struct Photograph<'a> {
     pub mixed: &'a [bool],
 }
 
-impl ImageError {
+impl ImageDifference {
     /// Compares a drawn image (premultiplied linear RGB, coverage) with a photograph of `width` pixels a row. A drawn pixel that is not
     /// finite counts as clear and has no slope.
     #[must_use]
@@ -123,7 +121,7 @@ impl ImageError {
         // A mean over the person, so that a small one counts as much as a large one.
         let person = mask.iter().map(|mask| f64::from(*mask)).sum::<f64>().max(1.0);
         let scale = (1.0 / person) as f32;
-        let mut error = Self { slope: vec![[0.0; 4]; count], pixels: vec![0.0; count], ..Self::default() };
+        let mut error = Self { slope: vec![[0.0; 4]; count], ..Self::default() };
         let planes: Vec<_> = (0..3)
             .into_par_iter()
             .map(|k| {
@@ -161,7 +159,6 @@ impl ImageError {
             for i in (0..count).filter(|i| !is_mixed(*i)) {
                 let difference = ours[i] - theirs[i];
                 error.squared += f64::from(difference * difference);
-                error.pixels[i] += difference * difference / 3.0;
                 let along = difference * inverse_lengths[i];
                 let slope = third
                     * (weights.color * along - weights.structure * structure[i] + weights.sharpness * sharpening[i]);
@@ -214,14 +211,14 @@ mod tests {
             .collect();
         let wanted: Vec<u8> = (0..width * 10 * 4).map(|_| random.random()).collect();
         let weights = ErrorWeights { color: 0.8, structure: 0.2, coverage: 0.3, sharpness: 0.7 };
-        let slope = ImageError::of(&drawn, photograph(&wanted), width, &weights).slope;
+        let slope = ImageDifference::of(&drawn, photograph(&wanted), width, &weights).slope;
         let mut worst = 0.0f64;
         for i in (0..drawn.len()).step_by(3) {
             for k in 0..4 {
                 let step = 1e-3;
                 let mut at = |by: f32| {
                     drawn[i][k] += by;
-                    let loss = ImageError::of(&drawn, photograph(&wanted), width, &weights).loss;
+                    let loss = ImageDifference::of(&drawn, photograph(&wanted), width, &weights).loss;
                     drawn[i][k] -= by;
                     loss
                 };
@@ -240,7 +237,7 @@ mod tests {
         let mut rgba: Vec<u8> = (0..drawn.len() * 4).map(|_| random.random()).collect();
         let mixed: Vec<bool> = (0..drawn.len()).map(|_| random.random()).collect();
         let weights = ErrorWeights { sharpness: 0.5, ..ErrorWeights::default() };
-        let of = |rgba: &[u8]| ImageError::of(&drawn, Photograph { rgba, mixed: &mixed }, width, &weights);
+        let of = |rgba: &[u8]| ImageDifference::of(&drawn, Photograph { rgba, mixed: &mixed }, width, &weights);
         let before = of(&rgba);
         for (pixel, _) in rgba.chunks_exact_mut(4).zip(&mixed).filter(|(_, mixed)| **mixed) {
             pixel[..3].iter_mut().for_each(|code| *code = !*code);
@@ -250,7 +247,7 @@ mod tests {
         for (slope, _) in before.slope.iter().zip(&mixed).filter(|(_, mixed)| **mixed) {
             assert!(slope[..3].iter().all(|slope| slope.abs() <= 0.0) && (slope[3].abs() - scale).abs() < 1e-3 * scale);
         }
-        assert!(before != ImageError::of(&drawn, photograph(&rgba), width, &weights));
+        assert!(before != ImageDifference::of(&drawn, photograph(&rgba), width, &weights));
     }
 
     #[test]
@@ -301,19 +298,19 @@ mod tests {
         };
         let mut drawn: Vec<[f32; 4]> =
             wanted.chunks_exact(4).map(|p| [linear(p[0]), linear(p[1]), linear(p[2]), 1.0]).collect();
-        let error = ImageError::of(&drawn, photograph(&wanted), 20, &ErrorWeights::default());
+        let error = ImageDifference::of(&drawn, photograph(&wanted), 20, &ErrorWeights::default());
         assert!(error.loss < 1e-3 && error.squared < 1e-8, "{} {}", error.loss, error.squared);
         drawn[3] = [f32::NAN, 0.0, 0.0, 1.0];
         drawn[5] = [f32::INFINITY; 4];
-        let error = ImageError::of(&drawn, photograph(&wanted), 20, &ErrorWeights::default());
+        let error = ImageDifference::of(&drawn, photograph(&wanted), 20, &ErrorWeights::default());
         assert!(
             error.loss.is_finite()
                 && error.slope[3].iter().all(|v| v.abs() <= 0.0)
                 && error.slope.iter().flatten().all(|v| v.is_finite())
         );
-        assert!(ImageError::of(&[], photograph(&[]), 20, &ErrorWeights::default()).slope.is_empty());
+        assert!(ImageDifference::of(&[], photograph(&[]), 20, &ErrorWeights::default()).slope.is_empty());
         // Nobody in the image: what is drawn is too much.
-        let error = ImageError::of(&[[0.5, 0.5, 0.5, 0.9]], photograph(&[0; 4]), 1, &ErrorWeights::default());
+        let error = ImageDifference::of(&[[0.5, 0.5, 0.5, 0.9]], photograph(&[0; 4]), 1, &ErrorWeights::default());
         assert!(error.loss > 0.1 && error.slope[0][3] > 0.0);
     }
 }

@@ -8,7 +8,7 @@ use flyrig_body::Skeleton;
 use flyrig_types::Pose;
 use glam::{DMat3, DQuat, DVec3};
 
-use crate::skinning::BoneSlope;
+use crate::fit::skinning::BoneSlope;
 
 /// Rates at the start and at the end: radians of turns, metres of shifts.
 const TURN_RATE_RAD: [f32; 2] = [1.5e-3, 1.5e-4];
@@ -179,12 +179,11 @@ mod tests {
     use rand::{RngExt as _, SeedableRng as _, rngs::StdRng};
 
     use super::*;
-    use crate::{
-        Avatar, Bones, PosedAvatar,
-        avatar::tests::{random_pose, small},
-        parameters::Element,
-        skinning::reference::loss,
-    };
+    use crate::fit::skinning::reference::loss;
+    use crate::model::avatar::Avatar;
+    use crate::model::avatar::tests::{random_pose, small};
+    use crate::model::parameters::Element;
+    use crate::model::posing::{Bones, PosedAvatar};
 
     /// Corrections at random of three frames.
     fn random_fit(avatar: &Avatar) -> PoseFit {

@@ -7,7 +7,9 @@
 use flyrig_body::SkinWeights;
 use rayon::prelude::*;
 
-use crate::{adam::Adam, neighbors::Neighbors, parameters::Element};
+use crate::fit::adam::Adam;
+use crate::model::neighbors::Neighbors;
+use crate::model::parameters::Element;
 
 /// Rates at the start and at the end.
 const RATE: [f32; 2] = [2e-2, 2e-3];
@@ -82,7 +84,7 @@ impl SkinFit {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::avatar::tests::small;
+    use crate::model::avatar::tests::small;
 
     fn sums_to_one(skin: &[SkinWeights]) -> bool {
         skin.iter().all(|skin| {

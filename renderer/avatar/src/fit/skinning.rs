@@ -7,7 +7,9 @@
 use glam::{DQuat, DVec3, DVec4, Quat, Vec3, Vec4};
 use rayon::prelude::*;
 
-use crate::{Avatar, Bones, PosedAvatar, parameters::Element};
+use crate::model::avatar::Avatar;
+use crate::model::parameters::Element;
+use crate::model::posing::{Bones, PosedAvatar};
 
 /// Gaussians that one thread sums up at once.
 const CHUNK: usize = 4096;
@@ -176,7 +178,7 @@ pub(crate) mod reference {
 #[cfg(test)]
 mod tests {
     use super::{reference::loss, *};
-    use crate::avatar::tests::{random_pose, small};
+    use crate::model::avatar::tests::{random_pose, small};
 
     #[test]
     fn derivatives_of_weights_are_those_of_finite_differences() {

@@ -1,15 +1,14 @@
 //! Images of a take, cut to the person.
 
-use std::ops::Range;
-
 use flyrig_types::Camera;
 
-use crate::{image_error::Photograph, outline::mixed, rest::BAND_PX};
+use crate::fit::image_error::Photograph;
+use crate::fit::outline::mixed;
 
 /// Images are cut to the person and so many pixels around.
 const MARGIN_PX: u32 = 12;
 /// Cut images have sides of so many pixels, or a multiple: buffers are made for each size.
-const SIDE_PX: u32 = BAND_PX;
+const SIDE_PX: u32 = 64;
 
 /// An image of the person, cut to it.
 #[derive(Debug, Clone)]
@@ -66,21 +65,8 @@ impl TrainingView {
         [self.camera.intrinsics.width, self.camera.intrinsics.height]
     }
 
-    /// Camera and bytes of some of its rows.
-    pub(crate) fn rows(&self, rows: &Range<u32>) -> (Camera, Photograph<'_>) {
-        let [width, height] = self.size();
-        let rows = rows.start.min(height)..rows.end.min(height);
-        let mut camera = self.camera.clone();
-        camera.intrinsics.center_px.y -= f64::from(rows.start);
-        camera.intrinsics.height = rows.end.saturating_sub(rows.start);
-        let pixel = |row: u32| row as usize * width as usize;
-        let (first, end) = (pixel(rows.start), pixel(rows.end));
-        let rgba = self.rgba.get(4 * first..4 * end).unwrap_or_default();
-        (camera, Photograph { rgba, mixed: self.mixed.get(first..end).unwrap_or_default() })
-    }
-
-    /// Pixels of the person in some rows: the sum of the mask's coverage.
-    pub(crate) fn person(&self, rows: &Range<u32>) -> f64 {
-        self.rows(rows).1.rgba.chunks_exact(4).map(|pixel| f64::from(pixel[3]) / 255.0).sum()
+    /// Returns the pixels to compare with.
+    pub(crate) fn photograph(&self) -> Photograph<'_> {
+        Photograph { rgba: &self.rgba, mixed: &self.mixed }
     }
 }

@@ -4,7 +4,8 @@ use flyrig_renderer::HarmonicOrder;
 use glam::{Vec2, Vec3};
 use rayon::prelude::*;
 
-use crate::{AvatarError, parameters::Element};
+use crate::error::AvatarError;
+use crate::model::parameters::Element;
 
 /// How the surface lies in the atlas.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]

@@ -6,7 +6,7 @@ use flyrig_learn::{
     burn_tensor::{Device, Tensor, activation},
 };
 
-use super::hash::WIDTH;
+use crate::local::hash::WIDTH;
 
 /// Width of the hidden layers.
 pub(super) const HIDDEN: usize = 64;

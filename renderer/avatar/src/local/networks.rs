@@ -9,12 +9,6 @@
 //! evaluated in every step into the avatar's lists, so that at the end nothing else is needed. Encoding, groups and query are linear: their
 //! derivatives are carried back by hand, those of the layers by burn.
 
-mod atlas_map;
-mod decoders;
-mod groups;
-mod hash;
-mod texture;
-
 use std::collections::BTreeMap;
 
 use flyrig_learn::{
@@ -24,13 +18,15 @@ use flyrig_learn::{
 };
 use glam::{Vec2, Vec3, Vec4};
 
-pub use atlas_map::AtlasLayout;
-use atlas_map::AtlasMap;
-use decoders::{OFFSET_M, branches, decode};
-use groups::{Groups, farthest};
-use hash::{Box3, FEATURES, HashEncoding, LEVELS, ROWS, WIDTH};
+use crate::local::atlas_map::{AtlasLayout, AtlasMap};
+use crate::local::decoders::{self, OFFSET_M, branches, decode};
+use crate::local::groups::{Groups, farthest};
+use crate::local::hash::{Box3, FEATURES, HashEncoding, LEVELS, ROWS, WIDTH};
+use crate::local::texture;
 
-use crate::{Avatar, AvatarError, Parameters, parameters::Element};
+use crate::error::AvatarError;
+use crate::model::avatar::Avatar;
+use crate::model::parameters::{Element, GaussianParameters};
 
 /// Exponential means of Adam.
 const BETAS: [f32; 2] = [0.9, 0.99];
@@ -114,7 +110,7 @@ pub(crate) struct Local {
     settings: LocalSettings,
     device: Device,
     /// Lists of the avatar as it was made, without colours, and places of its Gaussians.
-    start: Parameters,
+    start: GaussianParameters,
     places: Vec<Vec3>,
     around: Box3,
     stages: Vec<Stage>,
@@ -194,13 +190,13 @@ impl Local {
         flyrig_learn::count(&self.networks) + flyrig_learn::count(&self.tables)
     }
 
-    /// Whether a list of [`Parameters::lists`] is predicted. Others are learnt by themselves.
+    /// Whether a list of [`GaussianParameters::lists`] is predicted. Others are learnt by themselves.
     pub fn predicts(&self, list: usize) -> bool {
         if list == 3 { self.settings.colors } else { self.settings.geometry }
     }
 
     /// Writes what the networks say into an avatar's lists. Lists that they do not predict stay as they are.
-    pub fn evaluate(&mut self, into: &mut Parameters) {
+    pub fn evaluate(&mut self, into: &mut GaussianParameters) {
         let tensors = Tensors::new(&self.networks, &self.device, true);
         let mut lists = self.start.clone();
         for (list, (to, from)) in lists.lists_mut().into_iter().zip(into.lists()).enumerate() {
@@ -266,7 +262,7 @@ impl Local {
     }
 
     /// Looks anew where the inputs of later stages are, now and then.
-    pub fn refresh(&mut self, now: &Parameters) {
+    pub fn refresh(&mut self, now: &GaussianParameters) {
         if !self.step.is_multiple_of(REFRESH) {
             return;
         }
@@ -305,7 +301,7 @@ impl Local {
     }
 
     /// Goes on after [`Self::state`] was overwritten by that of a fit that had done so many steps.
-    pub fn resume(&mut self, step: u64, into: &mut Parameters) {
+    pub fn resume(&mut self, step: u64, into: &mut GaussianParameters) {
         self.step = step;
         self.encode_places();
         self.evaluate(into);
@@ -406,5 +402,5 @@ fn finite(list: &[Element]) -> Vec<Element> {
 }
 
 #[cfg(test)]
-#[path = "local_tests.rs"]
+#[path = "tests.rs"]
 mod tests;

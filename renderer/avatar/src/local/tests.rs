@@ -3,6 +3,7 @@ use flyrig_renderer::HarmonicOrder;
 use rand::{RngExt as _, SeedableRng as _, rngs::StdRng};
 
 use super::*;
+use crate::local::groups;
 
 fn avatar(count: usize, order: HarmonicOrder) -> (Avatar, Vec<Vec2>) {
     let template = default_template(&ShapeParams::default()).unwrap();
@@ -194,7 +195,7 @@ fn lists_are_those_of_the_definition_and_derivatives_those_of_finite_differences
 }
 
 /// Moves all lists towards others, and returns the mean squared distance.
-fn learn(local: &mut Local, wanted: &Parameters, now: &mut Parameters, steps: usize) -> f64 {
+fn learn(local: &mut Local, wanted: &GaussianParameters, now: &mut GaussianParameters, steps: usize) -> f64 {
     let mut sum = 0.0;
     for step in 0..steps {
         local.evaluate(now);
@@ -283,7 +284,7 @@ fn poison_spoils_no_network_and_few_gaussians_are_enough() {
         let mut few = avatar.clone();
         few.places.truncate(count);
         let [offset, shape, rotation, harmonics] = now.lists().map(<[Element]>::to_vec);
-        few.parameters = Parameters::from_lists([
+        few.parameters = GaussianParameters::from_lists([
             offset[..count].to_vec(),
             shape[..count].to_vec(),
             rotation[..count].to_vec(),
@@ -296,7 +297,7 @@ fn poison_spoils_no_network_and_few_gaussians_are_enough() {
     }
     let mut none = avatar.clone();
     none.places.clear();
-    none.parameters = Parameters::zeroed(0, HarmonicOrder::Zero);
+    none.parameters = GaussianParameters::zeroed(0, HarmonicOrder::Zero);
     assert!(Local::new(&none, &[], &settings(1), 1).unwrap().stages.is_empty());
 }
 

@@ -5,7 +5,8 @@ use flyrig_learn::{
     burn_tensor::{Device, Tensor, activation, module, ops::ConvOptions},
 };
 
-use super::{atlas_map::AtlasMap, decoders::he};
+use crate::local::atlas_map::AtlasMap;
+use crate::local::decoders::he;
 
 /// Features of a texel of the neural texture.
 pub(super) const FEATURES: usize = 8;

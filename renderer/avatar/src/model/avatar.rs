@@ -6,7 +6,10 @@ use flyrig_types::Pose;
 use glam::{DQuat, DVec3, Quat, Vec3};
 use serde::{Deserialize, Serialize};
 
-use crate::{AvatarError, KnownPoses, Light, Parameters};
+use crate::error::AvatarError;
+use crate::model::known_poses::KnownPoses;
+use crate::model::light::Light;
+use crate::model::parameters::GaussianParameters;
 
 /// Thickness of a Gaussian across the surface at the start, against its size along it.
 const THICKNESS: f32 = 0.5;
@@ -88,7 +91,7 @@ pub struct Avatar {
     /// Poses of the take.
     pub known_poses: KnownPoses,
     /// Fitted attributes of the Gaussians.
-    pub parameters: Parameters,
+    pub parameters: GaussianParameters,
     /// Light of the take's room.
     pub light: Light,
     /// Provenance.
@@ -110,7 +113,7 @@ impl Avatar {
     ) -> Result<Self, AvatarError> {
         template.check()?;
         let count = surface.len();
-        let mut parameters = Parameters::zeroed(count, order);
+        let mut parameters = GaussianParameters::zeroed(count, order);
         let logit = (OPACITY / (1.0 - OPACITY)).ln();
         for i in 0..count {
             let scale = surface.scale_m[i].max(1e-4).ln();
@@ -262,7 +265,12 @@ pub(crate) mod tests {
         assert!(with(&|avatar| avatar.parameters.shape[3][1] = f32::NAN).contains("not finite"));
         assert!(with(&|avatar| avatar.template.triangles[0][0] = u32::MAX).contains("triangle"));
         assert_eq!(
-            Parameters::from_lists([vec![[0.0; 4]; 3], vec![[0.0; 4]; 3], vec![[0.0; 4]; 3], vec![[0.0; 4]; 13]]),
+            GaussianParameters::from_lists([
+                vec![[0.0; 4]; 3],
+                vec![[0.0; 4]; 3],
+                vec![[0.0; 4]; 3],
+                vec![[0.0; 4]; 13]
+            ]),
             None
         );
     }

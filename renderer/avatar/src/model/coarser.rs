@@ -5,7 +5,9 @@ use glam::{Mat3, Quat, Vec3};
 use nalgebra::{Matrix3, SymmetricEigen, Vector3};
 use rayon::prelude::*;
 
-use crate::{Avatar, Parameters, neighbors::Neighbors, parameters::Element};
+use crate::model::avatar::Avatar;
+use crate::model::neighbors::Neighbors;
+use crate::model::parameters::{Element, GaussianParameters};
 
 /// Cosine between two normals from which surfaces count as one: the sides of a sleeve stay apart.
 const SAME_SIDE: f32 = 0.5;
@@ -23,7 +25,7 @@ impl Avatar {
         let pairs = self.pairs();
         let merged: Vec<_> = pairs.par_iter().with_min_len(256).map(|pair| self.merge(*pair)).collect();
         let order = self.parameters.order();
-        let mut parameters = Parameters::zeroed(pairs.len(), order);
+        let mut parameters = GaussianParameters::zeroed(pairs.len(), order);
         let colors = parameters.harmonics.chunks_exact_mut(order.coefficients());
         for ((i, merged), colors) in merged.into_iter().enumerate().zip(colors) {
             parameters.offset[i] = merged.offset;
@@ -89,7 +91,7 @@ impl Avatar {
     }
 
     fn merge(&self, [heavy, light]: [usize; 2]) -> Merged {
-        let Parameters { offset, shape, rotation, harmonics, .. } = &self.parameters;
+        let GaussianParameters { offset, shape, rotation, harmonics, .. } = &self.parameters;
         let coefficients = self.parameters.order().coefficients();
         let colors_of = |i: usize| &harmonics[i * coefficients..(i + 1) * coefficients];
         let own = || Merged {
@@ -166,7 +168,7 @@ mod tests {
     use glam::{DMat3, DQuat};
 
     use super::*;
-    use crate::avatar::tests::small;
+    use crate::model::avatar::tests::small;
 
     /// Moments of all Gaussians that hang on bodies at rest: weight, mean, second moments, mean colour.
     fn moments(avatar: &Avatar) -> (f64, glam::DVec3, DMat3, glam::DVec3) {

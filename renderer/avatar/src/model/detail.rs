@@ -5,7 +5,9 @@ use flyrig_gpu::{GpuContext, GpuError};
 use flyrig_types::{Camera, Pose, RenderedView};
 use glam::DVec3;
 
-use crate::{Avatar, AvatarScene, Bones};
+use crate::model::avatar::Avatar;
+use crate::model::posing::Bones;
+use crate::model::scene::AvatarScene;
 
 /// Distance between Gaussians that are not worth telling apart, pixels.
 const FINE_PX: f64 = 0.8;
@@ -134,7 +136,7 @@ mod tests {
     use flyrig_types::{Intrinsics, Isometry};
 
     use super::*;
-    use crate::avatar::tests::small;
+    use crate::model::avatar::tests::small;
 
     fn camera(pixels: u32, away_m: f64) -> Camera {
         Camera {

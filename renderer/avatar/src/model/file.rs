@@ -9,7 +9,11 @@ use glam::{DMat4, DQuat, DVec3, Quat, Vec2, Vec3};
 use safetensors::{Dtype, SafeTensors, tensor::TensorView};
 use serde::{Deserialize, Serialize};
 
-use crate::{Attachment, Avatar, AvatarError, Card, Hanging, KnownPoses, Light, Parameters};
+use crate::error::AvatarError;
+use crate::model::avatar::{Attachment, Avatar, Card, Hanging};
+use crate::model::known_poses::KnownPoses;
+use crate::model::light::Light;
+use crate::model::parameters::GaussianParameters;
 
 /// Version of the format; a file of another one is refused.
 const VERSION: u32 = 2;
@@ -223,7 +227,7 @@ impl Avatar {
         };
         let lists = LISTS.map(|name| rows::<f32, 4>(&file, name, Dtype::F32));
         let [offset, shape, rotation, harmonics] = lists;
-        let parameters = Parameters::from_lists([offset?, shape?, rotation?, harmonics?])
+        let parameters = GaussianParameters::from_lists([offset?, shape?, rotation?, harmonics?])
             .ok_or("its lists of Gaussians have different lengths")?;
         let light = match file.tensor("light") {
             // Avatars of before have none.
@@ -282,7 +286,7 @@ mod tests {
     use rand::{RngExt as _, SeedableRng as _, rngs::StdRng};
 
     use super::*;
-    use crate::avatar::tests::{random_pose, small};
+    use crate::model::avatar::tests::{random_pose, small};
 
     #[test]
     fn avatars_come_back_and_the_same_gives_the_same_bytes() {

@@ -59,7 +59,7 @@ fn squared_angles(a: &[DQuat], b: &[DQuat]) -> Vec<f64> {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::avatar::tests::small;
+    use crate::model::avatar::tests::small;
 
     #[test]
     fn poses_unlike_those_of_the_take_are_counted() {

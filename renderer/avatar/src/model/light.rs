@@ -7,7 +7,7 @@
 use flyrig_learn::{AdamStep, Moments};
 use glam::Vec3;
 
-use crate::parameters::Element;
+use crate::model::parameters::Element;
 
 /// Terms of the polynomial.
 const TERMS: usize = 9;

@@ -4,7 +4,7 @@
 use glam::Vec3;
 use rayon::prelude::*;
 
-use crate::parameters::Element;
+use crate::model::parameters::Element;
 
 /// Neighbours of a Gaussian.
 const NEAREST: usize = 6;

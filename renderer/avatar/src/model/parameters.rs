@@ -8,7 +8,7 @@ pub(crate) type Element = [f32; 4];
 
 /// Learnt attributes: a row a Gaussian, but as many rows of harmonics as their order has coefficients. Derivatives have the same form.
 #[derive(Debug, Clone, PartialEq)]
-pub struct Parameters {
+pub struct GaussianParameters {
     /// Offset from the Gaussian's place on the surface, canonical metres; w unused.
     pub offset: Vec<Element>,
     /// Logarithms of the standard deviations along the Gaussian's own axes in metres; w: logit of the opacity.
@@ -20,7 +20,7 @@ pub struct Parameters {
     order: HarmonicOrder,
 }
 
-impl Parameters {
+impl GaussianParameters {
     /// All zero, but rotations, which are the identity.
     #[must_use]
     pub fn zeroed(count: usize, order: HarmonicOrder) -> Self {

@@ -8,7 +8,8 @@ use flyrig_types::Pose;
 use glam::{DMat4, DVec3, Mat3, Mat4, Quat, Vec3, Vec4};
 use rayon::prelude::*;
 
-use crate::{Avatar, Parameters, parameters::Element};
+use crate::model::avatar::Avatar;
+use crate::model::parameters::{Element, GaussianParameters};
 
 /// Scales beyond these are not drawn, metres: an avatar is neither dust nor a room.
 const SCALE_M: std::ops::RangeInclusive<f32> = 2e-4..=0.1;
@@ -101,7 +102,7 @@ pub struct PosedAvatar {
     pub scale_opacity: Vec<Element>,
     /// Quaternion x, y, z, w, world from the Gaussian's axes.
     pub rotation: Vec<Element>,
-    /// Coefficients of the colours, lit, as in [`Parameters::harmonics`].
+    /// Coefficients of the colours, lit, as in [`GaussianParameters::harmonics`].
     pub harmonics: Vec<Element>,
     places: Vec<Place>,
 }
@@ -119,7 +120,7 @@ impl Avatar {
     /// Brings all Gaussians into the world. `translations` are those of the graph's nodes, canonical metres; without them, and where there
     /// are none, the mean of the take holds.
     pub fn pose(&self, bones: &Bones, translations: Option<&[DVec3]>, posed: &mut PosedAvatar) {
-        let Parameters { offset, shape, rotation, harmonics, .. } = &self.parameters;
+        let GaussianParameters { offset, shape, rotation, harmonics, .. } = &self.parameters;
         let nodes = self.hanging.as_ref();
         let translations = translations.or(nodes.map(|nodes| nodes.mean.as_slice())).unwrap_or_default();
         let of = |i: usize| {
@@ -199,7 +200,7 @@ impl PosedAvatar {
 
     /// Turns derivatives with respect to the lit colours into those of the unlit ones, in place, and returns those of the light's terms.
     pub(crate) fn to_light(&self, avatar: &Avatar, slopes: &mut [Element]) -> [[f32; 3]; 9] {
-        let Parameters { harmonics, .. } = &avatar.parameters;
+        let GaussianParameters { harmonics, .. } = &avatar.parameters;
         let normal = |i: usize| self.places.get(i).map_or(Vec3::ZERO, |place| place.normal);
         avatar.light.backward(normal, harmonics, slopes, avatar.parameters.order().coefficients())
     }
@@ -231,7 +232,7 @@ impl PosedAvatar {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::avatar::tests::{random_pose, small};
+    use crate::model::avatar::tests::{random_pose, small};
 
     /// A loss that weighs every number of the posed avatar.
     fn loss(avatar: &Avatar, bones: &Bones, translations: &[DVec3], weights: &[[Element; 3]]) -> f64 {
@@ -287,7 +288,7 @@ mod tests {
         let constant = Vec3::from(avatar.light.terms[0]);
         assert!(avatar.mean_shades().iter().all(|shade| shade.distance(constant) < 1e-6));
         let poses = [1, 2].map(|seed| random_pose(&avatar, seed).0);
-        avatar.known_poses = crate::KnownPoses::new(&poses);
+        avatar.known_poses = crate::model::known_poses::KnownPoses::new(&poses);
         avatar.parameters.harmonics.fill([1.0; 4]);
         let lit = poses.map(|pose| {
             let mut posed = PosedAvatar::default();

@@ -6,7 +6,9 @@ use flyrig_renderer::{AnisotropicBuffers, ViewPainter};
 use flyrig_types::{Camera, Pose, RenderedView};
 use glam::{DVec2, DVec3};
 
-use crate::{Attachment, Avatar, Bones, PosedAvatar, parameters::Element};
+use crate::model::avatar::{Attachment, Avatar};
+use crate::model::parameters::Element;
+use crate::model::posing::{Bones, PosedAvatar};
 
 /// A posed avatar on the adapter, as one camera sees it.
 #[derive(Debug)]
@@ -120,7 +122,7 @@ mod tests {
     use flyrig_types::{Intrinsics, Isometry};
 
     use super::*;
-    use crate::avatar::tests::small;
+    use crate::model::avatar::tests::small;
 
     #[test]
     fn boxes_are_around_the_part_and_within_the_image() {

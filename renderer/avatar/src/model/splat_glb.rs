@@ -7,7 +7,7 @@ use flyrig_renderer::{AnisotropicSplats, SH_DEGREE_0};
 use glam::{Quat, Vec3};
 use serde_json::{Map, Value, json};
 
-use crate::AvatarError;
+use crate::error::AvatarError;
 
 const EXTENSION: &str = "KHR_gaussian_splatting";
 /// The extension adds this to the sum of the harmonics.

@@ -5,10 +5,8 @@ use flyrig_body::{PointGrid, SurfaceGaussians, Template, VertexMeans, displaceme
 use glam::Vec3;
 use rayon::prelude::*;
 
-use crate::{
-    Avatar,
-    atlas::{REACH, Shown},
-};
+use crate::edit::atlas::{REACH, Shown};
+use crate::model::avatar::Avatar;
 
 /// Factors of the reach that are tried in turn, where no Gaussian is near.
 const WIDER: [f32; 3] = [1.0, 3.0, 9.0];
@@ -74,7 +72,8 @@ mod tests {
     use glam::DVec3;
 
     use super::*;
-    use crate::{atlas::KERNEL, avatar::tests::small};
+    use crate::edit::atlas::KERNEL;
+    use crate::model::avatar::tests::small;
 
     /// An avatar whose colours follow its places, and whose clothes hang elsewhere than the body.
     fn painted() -> Avatar {

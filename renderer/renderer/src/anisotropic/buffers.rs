@@ -3,34 +3,9 @@
 use flyrig_gpu::{GpuContext, GpuError, StorageBuffer};
 use wgpu::CommandEncoder;
 
-use crate::GaussianBuffers;
+use crate::anisotropic::order::HarmonicOrder;
+use crate::buffers::GaussianBuffers;
 use crate::schema::{self, GaussianElement};
-
-/// Order up to which the colours of a scene depend on the direction.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
-pub enum HarmonicOrder {
-    /// One colour for all directions.
-    Zero,
-    /// Linear in the direction.
-    One,
-    /// Quadratic in the direction.
-    Two,
-}
-
-impl HarmonicOrder {
-    /// All orders, the lowest first.
-    pub const ALL: [Self; 3] = [Self::Zero, Self::One, Self::Two];
-
-    /// Coefficients of one colour channel.
-    #[must_use]
-    pub const fn coefficients(self) -> usize {
-        match self {
-            Self::Zero => 1,
-            Self::One => 4,
-            Self::Two => 9,
-        }
-    }
-}
 
 /// Gaussians with three scales, a rotation, an opacity, and a colour that depends on the direction; a buffer for each of
 /// [`ANISOTROPIC_ATTRIBUTES`](crate::ANISOTROPIC_ATTRIBUTES).

@@ -1,4 +1,4 @@
-//! Colour by direction and its derivatives: `raster_harmonics.wgsl`, `raster_paint.wgsl` and `raster_backward_paint.wgsl` on the
+//! Colour by direction and its derivatives: `anisotropic/harmonics.wgsl`, `anisotropic/paint.wgsl` and `anisotropic/paint_backward.wgsl` on the
 //! processor.
 
 use glam::{Vec3, Vec4};
@@ -11,7 +11,7 @@ const C2_XX: f32 = 0.546_274_2;
 
 /// Coefficients of all Gaussians, and where they are seen from.
 #[derive(Clone, Copy)]
-pub(super) struct Harmonics<'a> {
+pub(crate) struct Harmonics<'a> {
     pub center: &'a [[f32; 4]],
     /// Those of one Gaussian follow each other.
     pub harmonics: &'a [[f32; 4]],

@@ -1,6 +1,6 @@
 // One invocation a Gaussian: colour of the drawn ones as the camera sees them. A colour that is not finite takes its Gaussian
 // out of the image.
-// Prefix: camera.wgsl, raster_frame.wgsl, the attributes `center` and `harmonics` at bindings 1 and 2, raster_harmonics.wgsl, const INVALID_KEY.
+// Prefix: camera.wgsl, raster/frame.wgsl, the attributes `center` and `harmonics` at bindings 1 and 2, anisotropic/harmonics.wgsl, const INVALID_KEY.
 @group(0) @binding(0) var<storage, read> frame: Frame;
 // (depth key, Gaussian)
 @group(0) @binding(3) var<storage, read_write> keyed: array<vec2<u32>>;

@@ -1,7 +1,7 @@
 // Derivative of the colours: one invocation a Gaussian carries dL/d its colour to the coefficients, and through the direction to
 // the centre. Adds to the outputs. Nothing flows where a channel is clamped at 0.
-// Prefix: camera.wgsl, raster_frame.wgsl, raster_backward_frame.wgsl, the attributes `center` and `harmonics` at bindings 1 and 2,
-// their derivatives at bindings 4 and 5, raster_harmonics.wgsl.
+// Prefix: camera.wgsl, raster/frame.wgsl, backward/frame.wgsl, the attributes `center` and `harmonics` at bindings 1 and 2,
+// their derivatives at bindings 4 and 5, anisotropic/harmonics.wgsl.
 @group(0) @binding(0) var<storage, read> frame: Frame;
 @group(0) @binding(3) var<storage, read> sums: array<PairSum>;
 

@@ -2,8 +2,9 @@
 
 use flyrig_gpu::{GpuContext, GpuError, read_all};
 
+use crate::anisotropic::buffers::AnisotropicBuffers;
+use crate::anisotropic::order::HarmonicOrder;
 use crate::schema::GaussianElement;
-use crate::{AnisotropicBuffers, HarmonicOrder};
 
 /// Anisotropic Gaussians in memory, element for element as in [`AnisotropicBuffers`].
 #[derive(Debug, Clone, PartialEq)]

@@ -5,7 +5,7 @@ use glam::Vec4;
 use rayon::prelude::*;
 use wgpu::{CommandEncoder, ComputePassDescriptor};
 
-use crate::scan::run;
+use crate::sort::scan::run;
 
 const WGSL: &str = include_str!("color_means.wgsl");
 

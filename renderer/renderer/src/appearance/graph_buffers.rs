@@ -4,7 +4,8 @@ use flyrig_body::DeformationGraph;
 use flyrig_gpu::{ComputeKernel, GpuContext, StorageBuffer};
 use wgpu::{BindGroup, Buffer};
 
-use super::{AppearanceError, DiffusionHierarchy};
+use crate::appearance::hierarchy::DiffusionHierarchy;
+use crate::appearance::settings::AppearanceError;
 
 /// Constant but for the last two.
 #[derive(Debug)]

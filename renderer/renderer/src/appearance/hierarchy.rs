@@ -4,7 +4,7 @@ use std::collections::BTreeMap;
 
 use flyrig_body::DeformationGraph;
 
-use super::AppearanceError;
+use crate::appearance::settings::AppearanceError;
 
 /// One level; level 0 are the graph's own nodes.
 #[derive(Debug, Clone, PartialEq)]

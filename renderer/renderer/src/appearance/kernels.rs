@@ -3,8 +3,9 @@
 use bytemuck::{Pod, Zeroable};
 use flyrig_gpu::{CAMERA_WGSL, ComputeKernel, GpuContext};
 
-use super::{AppearanceSettings, DiffusionHierarchy};
-use crate::linear_from_srgb;
+use crate::appearance::hierarchy::DiffusionHierarchy;
+use crate::appearance::settings::AppearanceSettings;
+use crate::color::linear_from_srgb;
 
 /// Threads a workgroup; 256 is the most that every adapter has.
 pub(super) const WORKGROUP: u32 = 256;
@@ -54,14 +55,14 @@ impl SettingsConstants {
 }
 
 #[derive(Debug)]
-pub(super) struct Kernels {
+pub(super) struct AppearanceKernels {
     pub(super) observe: ComputeKernel,
     pub(super) gather: ComputeKernel,
     pub(super) diffuse: ComputeKernel,
     pub(super) paint: ComputeKernel,
 }
 
-impl Kernels {
+impl AppearanceKernels {
     pub(super) fn new(gpu: &GpuContext) -> Self {
         let [observe, gather, diffuse, paint] =
             sources().map(|(name, source)| ComputeKernel::new(gpu, name, &[&source], "main"));

@@ -4,16 +4,18 @@ use flyrig_gpu::CameraConstants;
 use glam::{IVec2, Vec2, Vec3, Vec4};
 use rayon::prelude::*;
 
-use super::graph_buffers::GraphBuffers;
-use super::kernels::{MIN_COVERAGE, MIN_RENDERED_ALPHA, NEAR_M, SettingsConstants};
-use super::{DiffusionHierarchy, ViewInput};
-use crate::{GaussianBuffers, linear_from_srgb};
+use crate::appearance::graph_buffers::GraphBuffers;
+use crate::appearance::hierarchy::DiffusionHierarchy;
+use crate::appearance::kernels::{MIN_COVERAGE, MIN_RENDERED_ALPHA, NEAR_M, SettingsConstants};
+use crate::appearance::settings::ViewInput;
+use crate::buffers::GaussianBuffers;
+use crate::color::linear_from_srgb;
 
 /// Gaussians that one task paints.
 const CHUNK: usize = 2048;
 
 /// Observations of the views, an element a Gaussian.
-pub(super) struct Seen<'a> {
+pub(super) struct ObservationSums<'a> {
     /// Sum of weight times linear RGB; sum of weights.
     pub seen: &'a mut [[f32; 4]],
     /// Sum of Eq. 6 weights; exp(-k d) of the closest view.
@@ -48,7 +50,7 @@ pub(super) fn observe(
     view: &ViewInput<'_>,
     gaussians: &GaussianBuffers,
     linear: &[f32],
-    Seen { seen, quality, kept }: Seen<'_>,
+    ObservationSums { seen, quality, kept }: ObservationSums<'_>,
 ) {
     let posed = view.gaussians.unwrap_or(gaussians);
     let (Some(center_scale), Some(normal)) = (posed.center_scale.slice(), posed.normal.slice()) else { return };

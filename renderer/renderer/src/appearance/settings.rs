@@ -1,6 +1,6 @@
 //! What goes into direct appearance, and what can be wrong with it.
 
-use crate::GaussianBuffers;
+use crate::buffers::GaussianBuffers;
 use flyrig_gpu::{GpuError, StorageBuffer};
 use flyrig_types::{Camera, CameraId, MAX_IMAGE_SIDE};
 
@@ -36,23 +36,6 @@ pub struct Observations {
     pub node_seen: Vec<[f32; 4]>,
     /// By graph node: linear RGB diffused over the surface (old where nothing is filled in); w unused.
     pub node_color: Vec<[f32; 4]>,
-}
-
-/// [`Observations`] on the GPU, rows of the same meaning; buffers of nodes go on behind the last one.
-#[derive(Debug)]
-pub struct ObservationBuffers<'a> {
-    /// Of all views that there is room for, empty without [`DirectAppearance::keep_observations`](crate::DirectAppearance).
-    pub views: Vec<&'a StorageBuffer<[f32; 4]>>,
-    /// By Gaussian.
-    pub seen: &'a StorageBuffer<[f32; 4]>,
-    /// By Gaussian.
-    pub quality: &'a StorageBuffer<[f32; 2]>,
-    /// Number of graph nodes.
-    pub nodes: usize,
-    /// By graph node.
-    pub node_seen: &'a StorageBuffer<[f32; 4]>,
-    /// By graph node.
-    pub node_color: &'a StorageBuffer<[f32; 4]>,
 }
 
 /// How colours are gathered.

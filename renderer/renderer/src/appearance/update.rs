@@ -5,13 +5,12 @@ use flyrig_gpu::{CameraConstants, GpuContext, GpuError, GpuTimer, StorageBuffer,
 use flyrig_types::MAX_IMAGE_SIDE;
 use wgpu::{Buffer, BufferUsages, CommandEncoder, ComputePassDescriptor};
 
-use super::{
-    AppearanceError, AppearanceSettings, ObservationBuffers, Observations, ViewInput,
-    graph_buffers::GraphBuffers,
-    kernels::{Kernels, SettingsConstants, WORKGROUP},
-    processor::{self, Seen},
-};
-use crate::{GaussianBuffers, linear_from_srgb};
+use crate::appearance::graph_buffers::GraphBuffers;
+use crate::appearance::kernels::{AppearanceKernels, SettingsConstants, WORKGROUP};
+use crate::appearance::processor::{self, ObservationSums};
+use crate::appearance::settings::{AppearanceError, AppearanceSettings, Observations, ViewInput};
+use crate::buffers::GaussianBuffers;
+use crate::color::linear_from_srgb;
 
 const KEPT: &str = "observations of a view";
 
@@ -38,7 +37,7 @@ pub struct DirectAppearance {
 /// The kernels on the device, and what they are uploaded.
 #[derive(Debug)]
 struct DeviceKernels {
-    kernels: Kernels,
+    kernels: AppearanceKernels,
     settings: Buffer,
     /// One a view.
     cameras: Vec<Buffer>,
@@ -66,7 +65,7 @@ impl DirectAppearance {
             })
         };
         let device = (!gpu.is_on_processor()).then(|| DeviceKernels {
-            kernels: Kernels::new(gpu),
+            kernels: AppearanceKernels::new(gpu),
             settings: constants("appearance settings", size_of::<SettingsConstants>()),
             cameras: (0..max_views).map(|_| constants("view camera", size_of::<CameraConstants>())).collect(),
         });
@@ -196,7 +195,7 @@ impl DirectAppearance {
         let Some(linear) = self.linear_from_srgb.slice() else { return };
         for (view, kept) in views.iter().zip(&self.kept) {
             let Some(mut kept) = kept.slice_mut() else { return };
-            let out = Seen { seen: &mut seen, quality: &mut quality, kept: &mut kept };
+            let out = ObservationSums { seen: &mut seen, quality: &mut quality, kept: &mut kept };
             processor::observe(settings, view, gaussians, &linear, out);
         }
         if settings.space != 0 {
@@ -234,19 +233,6 @@ impl DirectAppearance {
             node_seen: self.graph.node_seen.read_first(gpu, nodes)?,
             node_color: self.graph.node_color.read_first(gpu, nodes)?,
         })
-    }
-
-    /// The same where it lies on the GPU.
-    #[must_use]
-    pub fn observation_buffers(&self) -> ObservationBuffers<'_> {
-        ObservationBuffers {
-            views: self.kept.iter().collect(),
-            seen: &self.seen,
-            quality: &self.quality,
-            nodes: self.graph.node_count as usize,
-            node_seen: &self.graph.node_seen,
-            node_color: &self.graph.node_color,
-        }
     }
 
     /// Reads the colour memory back: accumulated linear RGB of each Gaussian and its weight.

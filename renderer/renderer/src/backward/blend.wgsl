@@ -1,9 +1,9 @@
 // Derivative of the blending: one workgroup a tile, one invocation for four pixels of a column, as in
-// raster_blend.wgsl. The list is walked front to back again; what lies behind a splat is the finished pixel less
+// raster/blend.wgsl. The list is walked front to back again; what lies behind a splat is the finished pixel less
 // what was blended so far. Each (tile, Gaussian) pair gets one sum over the tile's pixels, in a fixed order.
 //
 // A tile whose incoming gradients are all zero ends at once; a pixel without any counts as finished.
-// Prefix: camera.wgsl, raster_frame.wgsl, raster_busy.wgsl, raster_backward_frame.wgsl, const TILE, CUT, MAX_ALPHA, OPAQUE, WITH_DEPTH,
+// Prefix: camera.wgsl, raster/frame.wgsl, raster/busy.wgsl, backward/frame.wgsl, const TILE, CUT, MAX_ALPHA, OPAQUE, WITH_DEPTH,
 // CARRY_COLOR, BATCH, MAX_LIST.
 @group(0) @binding(0) var<storage, read> frame: Frame;
 @group(0) @binding(1) var<storage, read> splats: array<Splat>;

@@ -5,15 +5,17 @@ use std::sync::OnceLock;
 use flyrig_gpu::{ComputeKernel, GpuContext, GpuError, StorageBuffer, dispatch_1d};
 use wgpu::{CommandEncoder, ComputePass, ComputePassDescriptor};
 
-use crate::raster_backward::Onto;
-use crate::raster_backward_kernels as kernels;
-use crate::raster_buffers::ImageBuffers;
-use crate::raster_device::{DeviceRasterizer, FRAME};
-use crate::raster_kernels::Tile;
-use crate::raster_settings::Latest;
-use crate::scan::run;
-use crate::sort::Keys;
-use crate::{Carry, HarmonicOrder, ImageGradients, RenderTarget};
+use crate::anisotropic::order::HarmonicOrder;
+use crate::backward::gradients::{Carry, ImageGradients};
+use crate::backward::kernels;
+use crate::backward::target::GradientTarget;
+use crate::buffers::RenderTarget;
+use crate::raster::buffers::ImageBuffers;
+use crate::raster::device::{DeviceRasterizer, FRAME};
+use crate::raster::kernels::Tile;
+use crate::raster::settings::Latest;
+use crate::sort::radix::Keys;
+use crate::sort::scan::run;
 
 /// [`BackwardRasterizer`](crate::BackwardRasterizer) on the device.
 #[derive(Debug)]
@@ -91,7 +93,7 @@ impl DeviceBackward {
         rasterizer: &DeviceRasterizer,
         target: &RenderTarget,
         incoming: &ImageGradients,
-        onto: Onto<'_>,
+        to: GradientTarget<'_>,
     ) -> Result<(), GpuError> {
         let (Some(picture), Some(latest)) = (&rasterizer.picture, rasterizer.latest) else { return Ok(()) };
         let layout = picture.layout();
@@ -105,9 +107,9 @@ impl DeviceBackward {
         let mut pass =
             encoder.begin_compute_pass(&ComputePassDescriptor { label: Some("backward"), ..Default::default() });
         self.place(&view, &mut pass);
-        self.blend(&view, &mut pass, onto);
+        self.blend(&view, &mut pass, to);
         self.sum(&view, &mut pass);
-        self.project(&view, &mut pass, onto);
+        self.project(&view, &mut pass, to);
         Ok(())
     }
 
@@ -125,10 +127,10 @@ impl DeviceBackward {
         run(view.gpu, pass, &self.place, &resources, view.by_gaussian());
     }
 
-    fn blend(&self, view: &View<'_>, pass: &mut ComputePass<'_>, onto: Onto<'_>) {
-        let (kernels, color) = match onto {
-            Onto::Isotropic { gaussians, .. } => (&self.blend, &gaussians.color),
-            Onto::Anisotropic { .. } => (&self.anisotropic(view.gpu).blend, &view.rasterizer.painted),
+    fn blend(&self, view: &View<'_>, pass: &mut ComputePass<'_>, to: GradientTarget<'_>) {
+        let (kernels, color) = match to {
+            GradientTarget::Isotropic { gaussians, .. } => (&self.blend, &gaussians.color),
+            GradientTarget::Anisotropic { .. } => (&self.anisotropic(view.gpu).blend, &view.rasterizer.painted),
         };
         let resources = [
             view.rasterizer.constants.get(FRAME),
@@ -159,17 +161,17 @@ impl DeviceBackward {
         run(view.gpu, pass, &self.sum, &resources, view.by_gaussian());
     }
 
-    fn project(&self, view: &View<'_>, pass: &mut ComputePass<'_>, onto: Onto<'_>) {
+    fn project(&self, view: &View<'_>, pass: &mut ComputePass<'_>, to: GradientTarget<'_>) {
         let (gpu, groups, frame) = (view.gpu, view.by_gaussian(), view.rasterizer.constants.get(FRAME));
         let sums = self.sums.raw().as_entire_binding();
-        match onto {
-            Onto::Isotropic { gaussians, carry, out } => {
+        match to {
+            GradientTarget::Isotropic { gaussians, carry, out } => {
                 let kernel = &self.project[usize::from(carry == Carry::Lift)];
                 let buffers = [&gaussians.center_scale, &out.center, &out.carried];
                 let [center_scale, center, carried] = buffers.map(|buffer| buffer.raw().as_entire_binding());
                 run(gpu, pass, kernel, &[frame, sums, center_scale, center, carried], groups);
             }
-            Onto::Anisotropic { gaussians, out } => {
+            GradientTarget::Anisotropic { gaussians, out } => {
                 let kernels = self.anisotropic(gpu);
                 let [center, scale, rotation, harmonics] =
                     gaussians.attributes().map(|buffer| buffer.raw().as_entire_binding());

@@ -2,16 +2,16 @@
 
 use flyrig_gpu::CAMERA_WGSL;
 
-use crate::HarmonicOrder;
-use crate::raster_kernels::{AXES_WGSL, BUSY_WGSL, FRAME_WGSL, Tile, harmonics_wgsl, of_kind};
+use crate::anisotropic::order::HarmonicOrder;
+use crate::raster::kernels::{AXES_WGSL, BUSY_WGSL, FRAME_WGSL, Tile, harmonics_wgsl, of_kind};
 use crate::schema::{CENTER, HARMONICS, ROTATION, SCALE_OPACITY, bindings_wgsl, derivatives_wgsl};
 
-const BACKWARD_FRAME_WGSL: &str = include_str!("raster_backward_frame.wgsl");
-const PLACES_WGSL: &str = include_str!("raster_backward_places.wgsl");
-const BLEND_WGSL: &str = include_str!("raster_backward_blend.wgsl");
-const PROJECT_WGSL: &str = include_str!("raster_backward_project.wgsl");
-const SUMS_WGSL: &str = include_str!("raster_backward_sums.wgsl");
-const PAINT_WGSL: &str = include_str!("raster_backward_paint.wgsl");
+const BACKWARD_FRAME_WGSL: &str = include_str!("frame.wgsl");
+const PLACES_WGSL: &str = include_str!("places.wgsl");
+const BLEND_WGSL: &str = include_str!("blend.wgsl");
+const PROJECT_WGSL: &str = include_str!("project.wgsl");
+const SUMS_WGSL: &str = include_str!("sums.wgsl");
+const PAINT_WGSL: &str = include_str!("../anisotropic/paint_backward.wgsl");
 
 /// Bytes of `struct PairSum`.
 pub(crate) const PAIR_SUM_BYTES: u64 = 48;

@@ -1,5 +1,5 @@
 // One invocation a rank of the depth order: where the sums of that Gaussian's tiles go (zeroed before).
-// Prefix: camera.wgsl, raster_frame.wgsl, raster_backward_frame.wgsl, const MAX_TILES.
+// Prefix: camera.wgsl, raster/frame.wgsl, backward/frame.wgsl, const MAX_TILES.
 @group(0) @binding(0) var<storage, read> frame: Frame;
 // x: slots there is room for
 @group(0) @binding(1) var<storage, read> room: vec4<u32>;

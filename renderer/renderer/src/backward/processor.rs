@@ -1,30 +1,30 @@
-//! Backward rasteriser: `raster_backward_blend.wgsl` on the processor, and the sums by Gaussian.
+//! Backward rasteriser: `backward/blend.wgsl` on the processor, and the sums by Gaussian.
+
+#![allow(clippy::needless_range_loop)] // one index for several lanes is what compilers turn into vectors
+
+mod project;
 
 use std::array::from_fn;
 
 use glam::{Vec3, Vec4};
 use rayon::prelude::*;
 
-use super::backward_project::{add_anisotropic, add_isotropic};
-use super::blend::{LOG2_CUT, TileLanes, exponents, is_opaque, rows_of};
-use super::harmonics::Harmonics;
-use super::lanes::{LANES, Lanes, exp2, sum, vectorized};
-use super::project::{Splat, TILE};
-use super::rasterizer::{Drawn, ProcessorRasterizer};
-use super::shape::Shape;
-use crate::raster_backward::Onto;
-use crate::raster_kernels::{MAX_ALPHA, OPAQUE};
-use crate::{
-    AnisotropicBuffers, AnisotropicGradients, Carry, GaussianBuffers, GaussianGradients, ImageGradients, RenderTarget,
-};
+use crate::anisotropic::buffers::{AnisotropicBuffers, AnisotropicGradients};
+use crate::anisotropic::harmonics::Harmonics;
+use crate::backward::gradients::{Carry, GaussianGradients, ImageGradients};
+use crate::backward::processor::project::{PairSum, add_anisotropic, add_isotropic};
+use crate::backward::target::GradientTarget;
+use crate::buffers::{GaussianBuffers, RenderTarget};
+use crate::raster::kernels::{MAX_ALPHA, OPAQUE};
+use crate::raster::processor::blend::{LOG2_CUT, TileLanes, exponents, is_opaque, rows_of};
+use crate::raster::processor::lanes::{LANES, Lanes, exp2, sum, vectorized};
+use crate::raster::processor::project::{ProjectedSplat, TILE};
+use crate::raster::processor::rasterizer::{ProcessorRasterizer, RasterImage};
+use crate::raster::processor::shape::Shape;
 
 const ROWS: usize = TILE as usize;
 /// Gaussians that one task carries to the world.
 const CHUNK: usize = 1024;
-
-/// Sums over pixels for one Gaussian. With e the exponent log2(alpha), s = dL/de of a pixel, (x, y) the pixel from the
-/// splat's centre and w its blending weight: s, s x, s y, w dL/d(depth sum), s x x, s x y, s y y, w, w carried.
-pub(super) type PairSum = [f32; 11];
 
 /// [`BackwardRasterizer`](crate::BackwardRasterizer) on the processor. Its arrays are used again.
 #[derive(Debug, Default)]
@@ -45,17 +45,17 @@ impl ProcessorBackward {
         rasterizer: &ProcessorRasterizer,
         target: &RenderTarget,
         incoming: &ImageGradients,
-        onto: Onto<'_>,
+        to: GradientTarget<'_>,
     ) {
         let Some(drawn) = &rasterizer.latest else { return };
-        match onto {
-            Onto::Isotropic { gaussians, carry, out } => {
+        match to {
+            GradientTarget::Isotropic { gaussians, carry, out } => {
                 let Some(color) = gaussians.color.slice() else { return };
                 if self.sum(rasterizer, (target, incoming, false), &color).is_some() {
                     self.add_isotropic(drawn, gaussians, carry, out);
                 }
             }
-            Onto::Anisotropic { gaussians, out } => {
+            GradientTarget::Anisotropic { gaussians, out } => {
                 if self.sum(rasterizer, (target, incoming, true), &rasterizer.lists.painted).is_some() {
                     self.add_anisotropic(drawn, gaussians, out);
                 }
@@ -131,7 +131,7 @@ impl ProcessorBackward {
     }
 
     /// Carries the sums to isotropic Gaussians.
-    fn add_isotropic(&self, drawn: &Drawn, gaussians: &GaussianBuffers, carry: Carry, out: &GaussianGradients) {
+    fn add_isotropic(&self, drawn: &RasterImage, gaussians: &GaussianBuffers, carry: Carry, out: &GaussianGradients) {
         let Some(center_scale) = gaussians.center_scale.slice() else { return };
         let (Some(mut center), Some(mut carried)) = (out.center.slice_mut(), out.carried.slice_mut()) else { return };
         let outs = center.par_chunks_mut(CHUNK).zip(carried.par_chunks_mut(2 * CHUNK));
@@ -149,7 +149,7 @@ impl ProcessorBackward {
     }
 
     /// Carries the sums to anisotropic Gaussians.
-    fn add_anisotropic(&self, drawn: &Drawn, gaussians: &AnisotropicBuffers, out: &AnisotropicGradients) {
+    fn add_anisotropic(&self, drawn: &RasterImage, gaussians: &AnisotropicBuffers, out: &AnisotropicGradients) {
         let slices = gaussians.attributes().map(flyrig_gpu::StorageBuffer::slice);
         let [Some(center), Some(scale_opacity), Some(rotation), Some(harmonics)] = &slices else { return };
         let slices = out.attributes().map(flyrig_gpu::StorageBuffer::slice_mut);
@@ -257,7 +257,7 @@ struct TileBackward<'a> {
     state: State,
     origin: [f32; 2],
     list: &'a [u32],
-    splats: &'a [Splat],
+    splats: &'a [ProjectedSplat],
     color: &'a [[f32; 4]],
     out: &'a mut [PairSum],
 }
@@ -286,7 +286,14 @@ impl pulp::NullaryFnOnce for TileBackward<'_> {
 impl State {
     /// Adds a splat's part of a row to its sums.
     #[inline(always)]
-    fn add_row(&mut self, splat: &Splat, paint: &[f32; 4], origin: [f32; 2], row: usize, sums: &mut [Lanes; 11]) {
+    fn add_row(
+        &mut self,
+        splat: &ProjectedSplat,
+        paint: &[f32; 4],
+        origin: [f32; 2],
+        row: usize,
+        sums: &mut [Lanes; 11],
+    ) {
         let exponents = exponents(splat, origin, row);
         let (opaque, most) = (OPAQUE as f32, MAX_ALPHA as f32);
         let mut touched = 0u32;

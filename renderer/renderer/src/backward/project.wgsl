@@ -5,8 +5,8 @@
 // lens's second derivatives). Nothing flows through what jumps: the cut at CUT, the end at OPAQUE, the order by depth,
 // back-face culling.
 // Lines between "// only isotropic" or "// only anisotropic" and "// end" belong to Gaussians of that kind.
-// Prefix: camera.wgsl, raster_frame.wgsl, raster_backward_frame.wgsl; for isotropic Gaussians const LIFT, for anisotropic ones
-// raster_axes.wgsl, their first three attributes at bindings 2 to 4 and derivatives at 5 to 7.
+// Prefix: camera.wgsl, raster/frame.wgsl, backward/frame.wgsl; for isotropic Gaussians const LIFT, for anisotropic ones
+// anisotropic/axes.wgsl, their first three attributes at bindings 2 to 4 and derivatives at 5 to 7.
 @group(0) @binding(0) var<storage, read> frame: Frame;
 @group(0) @binding(1) var<storage, read> sums: array<PairSum>;
 // only isotropic

@@ -3,32 +3,15 @@
 use flyrig_gpu::{GpuContext, GpuError};
 use wgpu::CommandEncoder;
 
-use crate::processor::ProcessorBackward;
-use crate::raster::RasterizerOn;
-use crate::raster_backward_device::DeviceBackward;
-use crate::raster_settings::Latest;
-use crate::{
-    AnisotropicBuffers, AnisotropicGradients, Carry, GaussianBuffers, GaussianGradients, HarmonicOrder, ImageGradients,
-    Rasterizer, RenderTarget,
-};
-
-/// Why there is no derivative.
-#[derive(Debug, thiserror::Error)]
-pub enum BackwardError {
-    /// Buffers must grow and cannot.
-    #[error(transparent)]
-    Gpu(#[from] GpuError),
-    /// A buffer does not belong to the image that was drawn last.
-    #[error("{what}: {found} elements where the image drawn last needs {needed}; make it for that image")]
-    Buffer {
-        /// Which buffer.
-        what: &'static str,
-        /// Its elements.
-        found: usize,
-        /// Elements needed.
-        needed: usize,
-    },
-}
+use crate::anisotropic::buffers::{AnisotropicBuffers, AnisotropicGradients};
+use crate::backward::device::DeviceBackward;
+use crate::backward::error::BackwardError;
+use crate::backward::gradients::{Carry, GaussianGradients, ImageGradients};
+use crate::backward::processor::ProcessorBackward;
+use crate::backward::target::{GradientTarget, check};
+use crate::buffers::{GaussianBuffers, RenderTarget};
+use crate::raster::rasterizer::Rasterizer;
+use crate::raster::rasterizer::RasterizerOn;
 
 /// Derivatives of [`Rasterizer`]'s images with respect to the centres of the Gaussians (FlyHuman section 3.1), and with respect
 /// to all attributes of [`AnisotropicBuffers`].
@@ -36,7 +19,7 @@ pub enum BackwardError {
 /// - Complete where the image is smooth: place, depth, and the size and shape of the ellipse, through the lens and
 ///   the low-pass filter. What jumps passes nothing on: a splat that enters or leaves a pixel at alpha 1/255, a pixel
 ///   that is finished, the order by depth, back-face culling; at the clamp (alpha 0.99) alpha itself is constant. On
-///   the built-in body the jumps are 4 to 6 % of the loss's true slope (`bench_backward`).
+///   the built-in body the jumps are 4 to 6 % of the loss's true slope (`--bench backward`).
 /// - No atomics: the sums of a tile go to a slot of their own and are added up row by row. Equal input gives equal
 ///   bytes on one device.
 /// - A tile without a gradient costs the look at its pixels; a Gaussian without a pixel that matters costs nothing
@@ -85,8 +68,8 @@ impl BackwardRasterizer {
         (incoming, carry): (&ImageGradients, Carry),
         out: &GaussianGradients,
     ) -> Result<(), BackwardError> {
-        let onto = Onto::Isotropic { gaussians, carry, out };
-        self.add(gpu, encoder, rasterizer, target, incoming, onto)
+        let to = GradientTarget::Isotropic { gaussians, carry, out };
+        self.add(gpu, encoder, rasterizer, target, incoming, to)
     }
 
     /// As [`Self::encode`], of an image of anisotropic Gaussians; nothing is recorded for one of isotropic ones or of another
@@ -105,7 +88,7 @@ impl BackwardRasterizer {
         incoming: &ImageGradients,
         out: &AnisotropicGradients,
     ) -> Result<(), BackwardError> {
-        self.add(gpu, encoder, rasterizer, target, incoming, Onto::Anisotropic { gaussians, out })
+        self.add(gpu, encoder, rasterizer, target, incoming, GradientTarget::Anisotropic { gaussians, out })
     }
 
     fn add(
@@ -115,59 +98,26 @@ impl BackwardRasterizer {
         rasterizer: &Rasterizer,
         target: &RenderTarget,
         incoming: &ImageGradients,
-        onto: Onto<'_>,
+        to: GradientTarget<'_>,
     ) -> Result<(), BackwardError> {
         let Some(latest) = rasterizer.latest() else { return Ok(()) };
-        if !latest.outputs.color || latest.gaussians == 0 || latest.order != onto.order() {
+        if !latest.outputs.color || latest.gaussians == 0 || latest.order != to.order() {
             return Ok(());
         }
         let pixels = latest.size[0] as usize * latest.size[1] as usize;
         check("dL/d colour", incoming.color.len(), pixels)?;
         check("dL/d depth", incoming.depth_carry.len(), pixels)?;
         check("the drawn image", target.color.len().min(target.depth.len()), pixels)?;
-        onto.check(&latest)?;
+        to.check(&latest)?;
         match (&mut self.on, &rasterizer.on) {
             (BackwardOn::Device(device), RasterizerOn::Device(rasterizer)) => {
-                device.encode(gpu, encoder, rasterizer, target, incoming, onto)?;
+                device.encode(gpu, encoder, rasterizer, target, incoming, to)?;
             }
             (BackwardOn::Processor(processor), RasterizerOn::Processor(rasterizer)) => {
-                processor.add(rasterizer, target, incoming, onto);
+                processor.add(rasterizer, target, incoming, to);
             }
             _ => {}
         }
         Ok(())
     }
-}
-
-/// Gaussians that derivatives are carried to, and where these are added.
-#[derive(Clone, Copy)]
-pub(crate) enum Onto<'a> {
-    Isotropic { gaussians: &'a GaussianBuffers, carry: Carry, out: &'a GaussianGradients },
-    Anisotropic { gaussians: &'a AnisotropicBuffers, out: &'a AnisotropicGradients },
-}
-
-impl Onto<'_> {
-    /// Order of the colours; None for isotropic Gaussians.
-    fn order(&self) -> Option<HarmonicOrder> {
-        match self {
-            Self::Isotropic { .. } => None,
-            Self::Anisotropic { gaussians, .. } => Some(gaussians.order()),
-        }
-    }
-
-    fn check(&self, latest: &Latest) -> Result<(), BackwardError> {
-        let (count, room) = match self {
-            Self::Isotropic { gaussians, out, .. } => (gaussians.count(), out.center.len().min(out.carried.len() / 2)),
-            Self::Anisotropic { gaussians, out } => {
-                let rows = out.center.len().min(out.scale_opacity.len()).min(out.rotation.len());
-                (gaussians.count(), rows.min(out.harmonics.len() / gaussians.order().coefficients()))
-            }
-        };
-        check("the Gaussians", count, latest.gaussians)?;
-        check("dL/d Gaussians", room, latest.gaussians)
-    }
-}
-
-fn check(what: &'static str, found: usize, needed: usize) -> Result<(), BackwardError> {
-    if found >= needed { Ok(()) } else { Err(BackwardError::Buffer { what, found, needed }) }
 }

@@ -1,5 +1,5 @@
 // One invocation a Gaussian: adds up the sums of its tiles row by row, for the kernels that carry them on.
-// Prefix: camera.wgsl, raster_frame.wgsl, raster_backward_frame.wgsl.
+// Prefix: camera.wgsl, raster/frame.wgsl, backward/frame.wgsl.
 @group(0) @binding(0) var<storage, read> frame: Frame;
 @group(0) @binding(1) var<storage, read> places: array<Place>;
 @group(0) @binding(2) var<storage, read> tile_limits: array<u32>;

@@ -6,9 +6,12 @@
 
 use std::path::Path;
 
-use crate::export::{SH_DEGREE_0, log_scale, opacity_logit, write_ply};
+use crate::anisotropic::order::HarmonicOrder;
+use crate::anisotropic::splats::AnisotropicSplats;
+use crate::files::ply::ExportError;
+use crate::files::ply::{SH_DEGREE_0, log_scale, opacity_logit, write_ply};
+use crate::schema::PLY_PROPERTIES;
 use crate::schema::anisotropic_ply_properties;
-use crate::{AnisotropicSplats, ExportError, HarmonicOrder, PLY_PROPERTIES};
 
 /// Why bytes are no PLY file of Gaussians.
 #[derive(Debug, thiserror::Error, PartialEq, Eq)]

@@ -112,3 +112,16 @@ fn damaged_files_are_refused_with_a_reason() {
     let commented = text("element vertex", "comment of another tool\nelement vertex");
     assert_eq!(parse_anisotropic_ply(&commented).unwrap().count(), 3);
 }
+
+#[test]
+fn refusals_name_the_file_and_leave_nothing() {
+    let folder = tempfile::tempdir().unwrap();
+    let one = splats(HarmonicOrder::Zero, 1);
+    let nowhere = folder.path().join("no/such/folder.ply");
+    assert!(write_anisotropic_ply(&nowhere, &one).unwrap_err().to_string().contains("no/such/folder.ply"));
+    // The target is a folder: the rename fails and the partial file goes.
+    let taken = folder.path().join("taken.ply");
+    fs::create_dir(&taken).unwrap();
+    assert!(matches!(write_anisotropic_ply(&taken, &one), Err(ExportError::Io { .. })));
+    assert_eq!(fs::read_dir(folder.path()).unwrap().count(), 1);
+}

@@ -6,11 +6,12 @@ use flyrig_gpu::StorageBuffer;
 use glam::Vec4;
 use rayon::prelude::*;
 
-use super::{ImageGradients, Loss, SUMS, UNKNOWN_RGBA};
+use crate::backward::gradients::ImageGradients;
+use crate::image_loss::settings::{LossConstants, SUMS, UNKNOWN_RGBA};
 
 /// Converts sRGB bytes with coverage to premultiplied linear colour at the compared size; negative where nothing is known.
 pub(super) fn unpack(
-    loss: &Loss,
+    loss: &LossConstants,
     bytes: &StorageBuffer<u32>,
     linear: &StorageBuffer<f32>,
     wanted: &StorageBuffer<[f32; 4]>,
@@ -42,7 +43,7 @@ pub(super) fn unpack(
 
 /// Compares a drawn image with the wanted one.
 pub(super) fn compare(
-    loss: &Loss,
+    loss: &LossConstants,
     wanted: &StorageBuffer<[f32; 4]>,
     drawn: &StorageBuffer<[f32; 4]>,
     out: &ImageGradients,
@@ -95,7 +96,7 @@ pub(super) fn compare(
 
 /// The rows of the area within an image: number of the row, and its part in the area.
 fn rows<'a>(
-    loss: &Loss,
+    loss: &LossConstants,
     picture: &'a mut [[f32; 4]],
 ) -> impl IndexedParallelIterator<Item = (usize, &'a mut [[f32; 4]])> {
     let (first, area) = (loss.first.map(|side| side as usize), loss.area.map(|side| side as usize));

@@ -1,8 +1,8 @@
 // Lists the Gaussians of every tile in depth order: pairs (tile, Gaussian) are written in depth order, and a stable sort by tile
-// (sort.wgsl) makes lists of them. Sharing by pairs bounds every loop, whatever the footprints: Mesa's software adapter
+// (sort/radix.wgsl) makes lists of them. Sharing by pairs bounds every loop, whatever the footprints: Mesa's software adapter
 // silently ends loops after 65535 iterations of one invocation.
-// No kernel uses more than 8 of the bindings: all that browsers promise (raster_shader_tests.rs).
-// Prefix: const LANES, BLOCK and DIGIT_BITS of the sort, camera.wgsl, raster_frame.wgsl.
+// No kernel uses more than 8 of the bindings: all that browsers promise (shader_tests.rs).
+// Prefix: const LANES, BLOCK and DIGIT_BITS of the sort, camera.wgsl, raster/frame.wgsl.
 @group(0) @binding(0) var<storage, read> frame: Frame;
 // (depth key, Gaussian), nearest first
 @group(0) @binding(1) var<storage, read> ordered: array<vec2<u32>>;

@@ -3,7 +3,7 @@
 // Four pixels share what is loaded of a splat, which is what the time goes into on Mesa's software adapter.
 // Lines between "// only NAME" and "// end" are left out of kernels that do not write that image: a binding counts
 // against the adapter's limit wherever it is declared and named, reached or not.
-// Prefix: camera.wgsl, raster_frame.wgsl, raster_busy.wgsl, const TILE, CUT, MAX_ALPHA, OPAQUE.
+// Prefix: camera.wgsl, raster/frame.wgsl, raster/busy.wgsl, const TILE, CUT, MAX_ALPHA, OPAQUE.
 @group(0) @binding(0) var<storage, read> frame: Frame;
 @group(0) @binding(1) var<storage, read> splats: array<Splat>;
 // only color

@@ -2,8 +2,8 @@
 
 use flyrig_gpu::{GpuContext, GpuError, MAX_WORKGROUPS_PER_DIMENSION, StorageBuffer};
 
-use crate::raster_kernels::{BINS_LANES, Tile};
-use crate::sort::{Keys, RadixSort};
+use crate::raster::kernels::{BINS_LANES, Tile};
+use crate::sort::radix::{Keys, RadixSort};
 
 /// Room for pairs of a Gaussian and a tile. A body-like surface needs about three a Gaussian; the share
 /// of the tiles is for a few Gaussians that cover the whole image.

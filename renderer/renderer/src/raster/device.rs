@@ -8,13 +8,15 @@ use flyrig_gpu::{CameraConstants, ComputeKernel, GpuContext, GpuError, GpuTimer,
 use flyrig_types::Camera;
 use wgpu::{BindingResource, BufferBinding, BufferSize, CommandEncoder, ComputePass, ComputePassDescriptor};
 
+use crate::anisotropic::buffers::Gaussians;
+use crate::buffers::RenderTarget;
 use crate::constants::Constants;
-use crate::raster_buffers::{ImageBuffers, Layout};
-use crate::raster_kernels::{BINS_LANES, Frame, RasterKernels, Tile};
-use crate::raster_settings::{Latest, tile_range};
-use crate::scan::{Groups, Scan, run, run_at};
-use crate::sort::{DIGIT_BITS, KEY_BITS, Keys, MOST_ELEMENTS, RadixSort, SortPass, blocks, table_len};
-use crate::{Gaussians, Outputs, RasterSettings, RasterStats, RenderTarget};
+use crate::raster::buffers::{ImageBuffers, Layout};
+use crate::raster::kernels::{BINS_LANES, FrameConstants, RasterKernels, Tile};
+use crate::raster::settings::{Latest, tile_range};
+use crate::raster::settings::{Outputs, RasterSettings, RasterStats};
+use crate::sort::radix::{DIGIT_BITS, KEY_BITS, Keys, MOST_ELEMENTS, RadixSort, SortPass, blocks, table_len};
+use crate::sort::scan::{Scan, Workgroups, run, run_at};
 
 /// [`Rasterizer`](crate::Rasterizer) on the device. Buffers and pipelines are made once; they grow with the image and the
 /// number of Gaussians.
@@ -29,7 +31,7 @@ pub(crate) struct DeviceRasterizer {
     pub(crate) painted: StorageBuffer<[f32; 4]>,
     pub(crate) pairs_before: StorageBuffer<u32>,
     pair_total: StorageBuffer<u32>,
-    /// `struct Work` of raster_bins.wgsl.
+    /// `struct Work` of bins.wgsl.
     work: StorageBuffer<u32>,
     stats: StorageBuffer<u32>,
     /// Of the image recorded last.
@@ -45,7 +47,7 @@ impl DeviceRasterizer {
 
     pub(crate) fn with_tile(gpu: &GpuContext, max_gaussians: usize, tile: Tile) -> Result<Self, GpuError> {
         check_count(max_gaussians)?;
-        let mut constants = vec![size_of::<Frame>()];
+        let mut constants = vec![size_of::<FrameConstants>()];
         constants.resize(DEPTH_PASSES, size_of::<[u32; 4]>());
         constants.resize(TILE_PASSES + MOST_TILE_PASSES, size_of::<SortPass>());
         Ok(Self {
@@ -82,7 +84,7 @@ impl DeviceRasterizer {
         let Some(picture) = &self.picture else { return Ok(()) };
         let layout = picture.layout();
         let (first_tile, blended) = tile_range(settings.area, layout.tiles, self.kernels.tile.0);
-        let frame = Frame {
+        let frame = FrameConstants {
             camera: CameraConstants::from(camera),
             size: [target.width, target.height],
             tiles: layout.tiles,
@@ -143,7 +145,7 @@ impl DeviceRasterizer {
         }
     }
 
-    fn encode_constants(&self, gpu: &GpuContext, encoder: &mut CommandEncoder, frame: &Frame, layout: Layout) {
+    fn encode_constants(&self, gpu: &GpuContext, encoder: &mut CommandEncoder, frame: &FrameConstants, layout: Layout) {
         let (count, pairs) = (frame.gaussians as usize, layout.pair_capacity as usize);
         let lengths = [frame.gaussians, table_len(count)].map(|length| [length, 0, 0, 0]);
         let passes = |count, keys: Keys| (0..keys.passes()).map(move |index| SortPass::new(count, keys, index));
@@ -237,11 +239,11 @@ impl Stages<'_> {
         run_at(self.gpu, pass, &k.count_pairs, &numbered(&resources, &[0, 1, 2, 3, 4]), ranks);
         r.scan.encode(self.gpu, pass, &r.constants.get(RANKS), &r.pairs_before, &r.pair_total);
         run_at(self.gpu, pass, &k.keep_pairs, &numbered(&resources, &[0, 2, 4, 5, 6, 9, 10]), (1, 1));
-        let pairs = Groups::Counted(&r.work, 16);
+        let pairs = Workgroups::Counted(&r.work, 16);
         run_at(self.gpu, pass, &k.write_pairs, &numbered(&resources, &[0, 1, 2, 3, 4, 6, 7]), pairs);
         let passes = self.passes(TILE_PASSES, layout.keys());
         let length = BufferBinding { buffer: r.work.raw(), offset: 0, size: BufferSize::new(16) };
-        let sorted = (Groups::Counted(&r.work, 32), layout.keys());
+        let sorted = (Workgroups::Counted(&r.work, 32), layout.keys());
         p.sort.encode(self.gpu, pass, sorted, &r.scan, &passes, &BindingResource::Buffer(length));
         resources[7] = p.lists().raw().as_entire_binding();
         let tiles = dispatch_1d(layout.tile_count(), BINS_LANES);
@@ -282,5 +284,5 @@ fn numbered<'a>(resources: &[BindingResource<'a>], used: &[u32]) -> Vec<(u32, Bi
 }
 
 #[cfg(test)]
-#[path = "raster_list_tests.rs"]
+#[path = "list_tests.rs"]
 mod tests;

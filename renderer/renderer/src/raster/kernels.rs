@@ -6,20 +6,21 @@ use std::sync::{Arc, Mutex, OnceLock, PoisonError};
 use bytemuck::{Pod, Zeroable};
 use flyrig_gpu::{CAMERA_WGSL, CameraConstants, ComputeKernel, GpuContext};
 
+use crate::anisotropic::order::HarmonicOrder;
+use crate::raster::settings::Outputs;
 use crate::schema::{CENTER, GAUSSIAN_ATTRIBUTES, HARMONICS, ROTATION, SCALE_OPACITY, bindings_wgsl};
-use crate::sort::{BLOCK, DIGIT_BITS, INVALID_KEY};
-use crate::{HarmonicOrder, Outputs};
+use crate::sort::radix::{BLOCK, DIGIT_BITS, INVALID_KEY};
 
-pub(crate) const FRAME_WGSL: &str = include_str!("raster_frame.wgsl");
-const PROJECT_WGSL: &str = include_str!("raster_project.wgsl");
-const BINS_WGSL: &str = include_str!("raster_bins.wgsl");
-pub(crate) const BUSY_WGSL: &str = include_str!("raster_busy.wgsl");
-const BLEND_WGSL: &str = include_str!("raster_blend.wgsl");
-pub(crate) const AXES_WGSL: &str = include_str!("raster_axes.wgsl");
-const HARMONICS_WGSL: &str = include_str!("raster_harmonics.wgsl");
-const PAINT_WGSL: &str = include_str!("raster_paint.wgsl");
+pub(crate) const FRAME_WGSL: &str = include_str!("frame.wgsl");
+const PROJECT_WGSL: &str = include_str!("project.wgsl");
+const BINS_WGSL: &str = include_str!("bins.wgsl");
+pub(crate) const BUSY_WGSL: &str = include_str!("busy.wgsl");
+const BLEND_WGSL: &str = include_str!("blend.wgsl");
+pub(crate) const AXES_WGSL: &str = include_str!("../anisotropic/axes.wgsl");
+const HARMONICS_WGSL: &str = include_str!("../anisotropic/harmonics.wgsl");
+const PAINT_WGSL: &str = include_str!("../anisotropic/paint.wgsl");
 
-/// Invocations of a workgroup of raster_bins.wgsl.
+/// Invocations of a workgroup of bins.wgsl.
 pub(crate) const BINS_LANES: u32 = 256;
 
 /// Alpha below which a splat does not touch a pixel.
@@ -57,10 +58,10 @@ impl Tile {
     }
 }
 
-/// Constants of one image, `struct Frame` in raster_frame.wgsl.
+/// Constants of one image, `struct Frame` in frame.wgsl.
 #[repr(C)]
 #[derive(Debug, Clone, Copy, Pod, Zeroable)]
-pub(crate) struct Frame {
+pub(crate) struct FrameConstants {
     pub camera: CameraConstants,
     pub size: [u32; 2],
     pub tiles: [u32; 2],
@@ -202,5 +203,5 @@ impl RasterKernels {
 }
 
 #[cfg(test)]
-#[path = "raster_shader_tests.rs"]
+#[path = "shader_tests.rs"]
 mod tests;

@@ -6,7 +6,7 @@ use flyrig_types::{Intrinsics, Isometry, Lens};
 use glam::{DVec2, DVec3};
 
 use super::*;
-use crate::GaussianBuffers;
+use crate::buffers::GaussianBuffers;
 
 #[test]
 fn every_tile_lists_its_gaussians_by_depth() {

@@ -9,15 +9,9 @@
 
 #![allow(clippy::needless_range_loop)] // one index for several lanes is what compilers turn into vectors
 
-mod backward;
-mod backward_project;
-mod blend;
-mod harmonics;
-mod lanes;
-mod lists;
-mod project;
-mod rasterizer;
-mod shape;
-
-pub(crate) use backward::ProcessorBackward;
-pub(crate) use rasterizer::ProcessorRasterizer;
+pub(crate) mod blend;
+pub(crate) mod lanes;
+pub(crate) mod lists;
+pub(crate) mod project;
+pub(crate) mod rasterizer;
+pub(crate) mod shape;

@@ -1,7 +1,7 @@
 // One invocation a Gaussian: EWA projection (Zwicker et al. 2001) through the lens, low-pass filter,
 // the rectangle of tiles it can reach, and its depth key.
 // Lines between "// only isotropic" or "// only anisotropic" and "// end" belong to Gaussians of that kind.
-// Prefix: camera.wgsl, raster_frame.wgsl, the attributes' bindings, raster_axes.wgsl for anisotropic Gaussians, const TILE,
+// Prefix: camera.wgsl, raster/frame.wgsl, the attributes' bindings, anisotropic/axes.wgsl for anisotropic Gaussians, const TILE,
 // INVALID_KEY, CUT, BACKFACING_COSINE.
 @group(0) @binding(0) var<storage, read> frame: Frame;
 // Bindings 1 to 4: the attributes of the Gaussians (schema.rs), the first three of anisotropic ones.

@@ -6,10 +6,12 @@ use flyrig_gpu::{GpuContext, GpuError, GpuTimer};
 use flyrig_types::Camera;
 use wgpu::CommandEncoder;
 
-use crate::processor::ProcessorRasterizer;
-use crate::raster_device::DeviceRasterizer;
-use crate::raster_settings::Latest;
-use crate::{Gaussians, RasterSettings, RasterStats, RenderTarget};
+use crate::anisotropic::buffers::Gaussians;
+use crate::buffers::RenderTarget;
+use crate::raster::device::DeviceRasterizer;
+use crate::raster::processor::rasterizer::ProcessorRasterizer;
+use crate::raster::settings::Latest;
+use crate::raster::settings::{RasterSettings, RasterStats};
 
 /// Draws Gaussians into images: projection through the camera's lens (EWA splatting), stable
 /// sort by depth, lists by tile, and front-to-back blending, all on the device without a wait, or on the processor when the

@@ -1,6 +1,7 @@
 //! Settings of a rendering, and figures of the latest one.
 
-use crate::{Gaussians, HarmonicOrder};
+use crate::anisotropic::buffers::Gaussians;
+use crate::anisotropic::order::HarmonicOrder;
 
 /// Which images of a [`crate::RenderTarget`] are written; the others keep their content.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]

@@ -3,9 +3,9 @@
 use naga::valid::{Capabilities, ModuleInfo, ValidationFlags, Validator};
 
 use super::*;
-use crate::raster_backward_kernels as backward;
-use crate::scan::scan_wgsl;
-use crate::sort::sort_wgsl;
+use crate::backward::kernels as backward;
+use crate::sort::radix::sort_wgsl;
+use crate::sort::scan::scan_wgsl;
 
 fn validate(name: &str, source: &str) {
     assert!(!source.contains("var<uniform>"), "{name}: see constants.rs");
@@ -44,8 +44,8 @@ fn every_kernel_is_valid_wgsl_and_the_uniform_has_its_layout() {
     validate("project anisotropic backward", &backward::project_anisotropic_wgsl());
     let module = naga::front::wgsl::parse_str(&bins_wgsl()).unwrap();
     let frame = module.types.iter().find(|(_, t)| t.name.as_deref() == Some("Frame")).unwrap().1;
-    let naga::TypeInner::Struct { span, .. } = frame.inner else { panic!("Frame is a struct") };
-    assert_eq!(span as usize, size_of::<Frame>());
+    let naga::TypeInner::Struct { span, .. } = frame.inner else { panic!("FrameConstants is a struct") };
+    assert_eq!(span as usize, size_of::<FrameConstants>());
 }
 
 /// Storage buffers that a browser's adapter offers a shader stage at least (WebGPU's default limit).

@@ -4,9 +4,9 @@ use bytemuck::{Pod, Zeroable};
 use flyrig_gpu::{ComputeKernel, GpuContext, GpuError, StorageBuffer};
 use wgpu::{BindingResource, CommandEncoder, ComputePass};
 
-use crate::scan::{Groups, Scan, run};
+use crate::sort::scan::{Scan, Workgroups, run};
 
-const SORT_WGSL: &str = include_str!("sort.wgsl");
+const SORT_WGSL: &str = include_str!("radix.wgsl");
 /// Elements with this key are left out of the result.
 pub(crate) const INVALID_KEY: u32 = u32::MAX;
 /// Bits a pass.
@@ -135,7 +135,7 @@ impl RadixSort {
         &self,
         gpu: &GpuContext,
         pass: &mut ComputePass<'_>,
-        (groups, keys): (Groups<'_>, Keys),
+        (groups, keys): (Workgroups<'_>, Keys),
         scan: &Scan,
         passes: &[BindingResource<'_>],
         scan_length: &BindingResource<'_>,
@@ -168,5 +168,5 @@ pub(crate) fn sort_wgsl() -> String {
 }
 
 #[cfg(test)]
-#[path = "sort_tests.rs"]
+#[path = "tests.rs"]
 mod tests;

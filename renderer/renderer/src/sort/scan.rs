@@ -52,14 +52,14 @@ pub(crate) fn scan_wgsl() -> String {
 
 /// How many workgroups a dispatch has.
 #[derive(Debug, Clone, Copy)]
-pub(crate) enum Groups<'a> {
+pub(crate) enum Workgroups<'a> {
     /// In x and y.
     Fixed(u32, u32),
     /// As three numbers in a buffer say, from this byte on.
     Counted(&'a StorageBuffer<u32>, u64),
 }
 
-impl From<(u32, u32)> for Groups<'_> {
+impl From<(u32, u32)> for Workgroups<'_> {
     fn from((x, y): (u32, u32)) -> Self {
         Self::Fixed(x, y)
     }
@@ -71,7 +71,7 @@ pub(crate) fn run<'a>(
     pass: &mut ComputePass<'_>,
     kernel: &ComputeKernel,
     resources: &[BindingResource<'_>],
-    groups: impl Into<Groups<'a>>,
+    groups: impl Into<Workgroups<'a>>,
 ) {
     dispatch(gpu, pass, kernel, &kernel.bind(gpu, resources), groups.into());
 }
@@ -82,7 +82,7 @@ pub(crate) fn run_at<'a>(
     pass: &mut ComputePass<'_>,
     kernel: &ComputeKernel,
     resources: &[(u32, BindingResource<'_>)],
-    groups: impl Into<Groups<'a>>,
+    groups: impl Into<Workgroups<'a>>,
 ) {
     dispatch(gpu, pass, kernel, &kernel.bind_at(gpu, resources), groups.into());
 }
@@ -92,13 +92,13 @@ fn dispatch(
     pass: &mut ComputePass<'_>,
     kernel: &ComputeKernel,
     group: &BindGroup,
-    groups: Groups<'_>,
+    groups: Workgroups<'_>,
 ) {
     gpu.count_dispatch();
     pass.set_pipeline(&kernel.pipeline);
     pass.set_bind_group(0, group, &[]);
     match groups {
-        Groups::Fixed(x, y) => pass.dispatch_workgroups(x, y, 1),
-        Groups::Counted(counts, offset) => pass.dispatch_workgroups_indirect(counts.raw(), offset),
+        Workgroups::Fixed(x, y) => pass.dispatch_workgroups(x, y, 1),
+        Workgroups::Counted(counts, offset) => pass.dispatch_workgroups_indirect(counts.raw(), offset),
     }
 }

@@ -1,19 +1,22 @@
-//! Derivative of the projection: `raster_backward_project.wgsl` on the processor.
+//! Derivative of the projection: `backward/project.wgsl` on the processor.
 
 use flyrig_gpu::CameraConstants;
 use glam::{Mat2, Mat3, Vec2, Vec3, Vec4};
 
-use super::backward::PairSum;
-use super::rasterizer::Drawn;
-use super::shape::{Shape, camera_rotation, rows_along, rows_of};
-use crate::Carry;
+use crate::backward::gradients::Carry;
+use crate::raster::processor::rasterizer::RasterImage;
+use crate::raster::processor::shape::{Shape, camera_rotation, rows_along, rows_of};
 
 /// 1 / (2 ln 2): the conics are for exp2.
 const HALF_LOG2_E: f32 = 0.5 * std::f32::consts::LOG2_E;
 
+/// Sums over pixels for one Gaussian. With e the exponent log2(alpha), s = dL/de of a pixel, (x, y) the pixel from the
+/// splat's centre and w its blending weight: s, s x, s y, w dL/d(depth sum), s x x, s x y, s y y, w, w carried.
+pub(super) type PairSum = [f32; 11];
+
 /// Carries an isotropic Gaussian's sums through the filtered ellipse, the lens and the camera to the world.
 pub(super) fn add_isotropic(
-    drawn: &Drawn,
+    drawn: &RasterImage,
     sums: &PairSum,
     center_scale: &[f32; 4],
     carry: Carry,
@@ -23,7 +26,7 @@ pub(super) fn add_isotropic(
     let [.., weight, a, b, c] = *sums;
     let carried = [a, b, c];
     let [x, y, z, scale] = *center_scale;
-    let view = Seen::new(&drawn.camera, Vec3::new(x, y, z));
+    let view = ProjectedPoint::new(&drawn.camera, Vec3::new(x, y, z));
     let rows = rows_of(&view.jacobian).map(|row| row * scale);
     let (d_pixel, d_covariance) = through_ellipse(drawn, sums, rows);
     // Covariance = scale^2 J J^T.
@@ -51,13 +54,13 @@ pub(super) fn add_isotropic(
 
 /// Carries an anisotropic Gaussian's sums to its centre, its scales and opacity, and its rotation.
 pub(super) fn add_anisotropic(
-    drawn: &Drawn,
+    drawn: &RasterImage,
     sums: &PairSum,
     center: &[f32; 4],
     shape: &Shape,
     [center_out, scale_out, rotation_out]: [&mut [f32; 4]; 3],
 ) {
-    let view = Seen::new(&drawn.camera, Vec4::from(*center).truncate());
+    let view = ProjectedPoint::new(&drawn.camera, Vec4::from(*center).truncate());
     let axes = shape.axes_in_camera(&drawn.camera);
     let along_axes = rows_along(&view.jacobian, &axes);
     let rows = along_axes.map(|row| row * shape.scale_m);
@@ -96,7 +99,7 @@ fn add(out: &mut [f32; 4], more: Vec4) {
 
 /// dL/d pixel and dL/d covariance before the filter, whose matrix root has these rows: through the conic, and through the opacity
 /// sqrt(det / filtered_det).
-fn through_ellipse(drawn: &Drawn, sums: &PairSum, [row_x, row_y]: [Vec3; 2]) -> (Vec2, Mat2) {
+fn through_ellipse(drawn: &RasterImage, sums: &PairSum, [row_x, row_y]: [Vec3; 2]) -> (Vec2, Mat2) {
     let [slope, slope_x, slope_y, _, xx_moment, xy_moment, yy_moment, ..] = *sums;
     let (xx, xy, yy) = (row_x.dot(row_x), row_x.dot(row_y), row_y.dot(row_y));
     let det = row_x.cross(row_y).length_squared();
@@ -113,7 +116,7 @@ fn through_ellipse(drawn: &Drawn, sums: &PairSum, [row_x, row_y]: [Vec3; 2]) -> 
 }
 
 /// A point in the image.
-struct Seen<'a> {
+struct ProjectedPoint<'a> {
     camera: &'a CameraConstants,
     ideal: Vec2,
     inverse_z: f32,
@@ -122,7 +125,7 @@ struct Seen<'a> {
     world_from_camera: Mat3,
 }
 
-impl<'a> Seen<'a> {
+impl<'a> ProjectedPoint<'a> {
     fn new(camera: &'a CameraConstants, world: Vec3) -> Self {
         let p = camera.to_camera(world);
         let inverse_z = 1.0 / p.z;

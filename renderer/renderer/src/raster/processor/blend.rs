@@ -1,20 +1,20 @@
-//! Blending of a tile: `raster_blend.wgsl` on the processor.
+//! Blending of a tile: `raster/blend.wgsl` on the processor.
 
-use super::lanes::{LANES, Lanes, exp2};
-use super::project::{Splat, TILE};
-use crate::Outputs;
-use crate::raster_kernels::{MAX_ALPHA, OPAQUE};
+use crate::raster::kernels::{MAX_ALPHA, OPAQUE};
+use crate::raster::processor::lanes::{LANES, Lanes, exp2};
+use crate::raster::processor::project::{ProjectedSplat, TILE};
+use crate::raster::settings::Outputs;
 
 const ROWS: usize = TILE as usize;
 /// Splats after which it is looked whether every pixel is opaque.
 const OPAQUE_EVERY: usize = 8;
 
 /// One number a pixel of a tile, row by row.
-pub(super) type TileLanes = [Lanes; ROWS];
+pub(crate) type TileLanes = [Lanes; ROWS];
 
 /// A tile while it is blended. Sums of weight times value; `coverage` the sum of the weights.
 #[derive(Debug, Clone)]
-pub(super) struct Tile {
+pub(crate) struct BlendedTile {
     pub transmittance: TileLanes,
     pub coverage: TileLanes,
     pub color: [TileLanes; 3],
@@ -22,7 +22,7 @@ pub(super) struct Tile {
     pub canonical: [TileLanes; 3],
 }
 
-impl Tile {
+impl BlendedTile {
     fn new() -> Self {
         const ZERO: TileLanes = [[0.0; LANES]; ROWS];
         Self {
@@ -36,23 +36,23 @@ impl Tile {
 }
 
 /// Blends a tile's list front to back.
-pub(super) struct BlendTile<'a> {
+pub(crate) struct BlendTile<'a> {
     /// First pixel.
     pub origin: [f32; 2],
     /// Gaussians, nearest first.
     pub list: &'a [u32],
-    pub splats: &'a [Splat],
+    pub splats: &'a [ProjectedSplat],
     pub color: &'a [[f32; 4]],
     pub canonical: &'a [[f32; 4]],
     pub outputs: Outputs,
 }
 
 impl pulp::NullaryFnOnce for BlendTile<'_> {
-    type Output = Tile;
+    type Output = BlendedTile;
 
     #[inline(always)]
-    fn call(self) -> Tile {
-        let mut tile = Tile::new();
+    fn call(self) -> BlendedTile {
+        let mut tile = BlendedTile::new();
         for (index, &gaussian) in self.list.iter().enumerate() {
             let splat = &self.splats[gaussian as usize];
             for row in rows_of(splat, self.origin[1]) {
@@ -84,7 +84,7 @@ impl pulp::NullaryFnOnce for BlendTile<'_> {
 
 /// Rows of a tile that begins at pixel row `top` in which the splat can be seen.
 #[inline(always)]
-pub(super) fn rows_of(splat: &Splat, top: f32) -> std::ops::Range<usize> {
+pub(crate) fn rows_of(splat: &ProjectedSplat, top: f32) -> std::ops::Range<usize> {
     // `as` saturates: rows above the tile become 0.
     let first = (splat.pixel.y - splat.reach_y - top).ceil() as usize;
     let end = (splat.pixel.y + splat.reach_y - top + 1.0).floor() as usize;
@@ -93,7 +93,7 @@ pub(super) fn rows_of(splat: &Splat, top: f32) -> std::ops::Range<usize> {
 
 /// log2(alpha) of a splat at the pixels of a row.
 #[inline(always)]
-pub(super) fn exponents(splat: &Splat, origin: [f32; 2], row: usize) -> Lanes {
+pub(crate) fn exponents(splat: &ProjectedSplat, origin: [f32; 2], row: usize) -> Lanes {
     let dy = origin[1] + row as f32 - splat.pixel.y;
     let [a, b, c] = splat.conic;
     let mut exponents = [0.0; LANES];
@@ -106,7 +106,7 @@ pub(super) fn exponents(splat: &Splat, origin: [f32; 2], row: usize) -> Lanes {
 
 /// Weights of a splat at the pixels of a row, whose transmittance falls; None where it touches none.
 #[inline(always)]
-fn weigh(splat: &Splat, origin: [f32; 2], row: usize, transmittance: &mut Lanes) -> Option<Lanes> {
+fn weigh(splat: &ProjectedSplat, origin: [f32; 2], row: usize, transmittance: &mut Lanes) -> Option<Lanes> {
     let exponents = exponents(splat, origin, row);
     let (cut, opaque, most) = (LOG2_CUT, OPAQUE as f32, MAX_ALPHA as f32);
     let mut touched = 0u32;
@@ -129,7 +129,7 @@ fn weigh(splat: &Splat, origin: [f32; 2], row: usize, transmittance: &mut Lanes)
 }
 
 /// log2 of the alpha below which a splat does not touch a pixel.
-pub(super) const LOG2_CUT: f32 = -7.994_353_4;
+pub(crate) const LOG2_CUT: f32 = -7.994_353_4;
 
 #[inline(always)]
 fn add(sum: &mut Lanes, weight: &Lanes, value: f32) {
@@ -140,7 +140,7 @@ fn add(sum: &mut Lanes, weight: &Lanes, value: f32) {
 
 /// Whether every pixel of a tile is finished.
 #[inline(always)]
-pub(super) fn is_opaque(transmittance: &TileLanes) -> bool {
+pub(crate) fn is_opaque(transmittance: &TileLanes) -> bool {
     let mut open = 0u32;
     for row in transmittance {
         for lane in row {
@@ -156,6 +156,6 @@ mod tests {
 
     #[test]
     fn the_cut_is_that_of_the_other_kernels() {
-        assert!((f64::from(LOG2_CUT) - crate::raster_kernels::CUT.log2()).abs() < 1e-6);
+        assert!((f64::from(LOG2_CUT) - crate::raster::kernels::CUT.log2()).abs() < 1e-6);
     }
 }

@@ -3,15 +3,15 @@
 use std::array::from_fn;
 
 /// Pixels of a row that are computed together.
-pub(super) const LANES: usize = 8;
+pub(crate) const LANES: usize = 8;
 
 /// One number a pixel.
-pub(super) type Lanes = [f32; LANES];
+pub(crate) type Lanes = [f32; LANES];
 
 /// Runs `work` compiled for the best vector instructions that the processor has. The work must be inlined into the call,
 /// or it stays as it was compiled.
 #[inline]
-pub(super) fn vectorized<W: pulp::NullaryFnOnce>(work: W) -> W::Output {
+pub(crate) fn vectorized<W: pulp::NullaryFnOnce>(work: W) -> W::Output {
     pulp::Arch::new().dispatch(work)
 }
 
@@ -20,7 +20,7 @@ pub(super) fn vectorized<W: pulp::NullaryFnOnce>(work: W) -> W::Output {
 /// No multiply-add: it rounds once where processors have it and twice where they have not, and the same input would give
 /// different bytes.
 #[inline(always)]
-pub(super) fn exp2(x: f32) -> f32 {
+pub(crate) fn exp2(x: f32) -> f32 {
     // Adding 1.5 * 2^23 rounds to an integer, which is then in the lowest bits.
     const ROUND: f32 = 12_582_912.0;
     // ln(2)^n / n!
@@ -39,7 +39,7 @@ pub(super) fn exp2(x: f32) -> f32 {
 
 /// Sum of the lanes, in a fixed order.
 #[inline(always)]
-pub(super) fn sum(lanes: &Lanes) -> f32 {
+pub(crate) fn sum(lanes: &Lanes) -> f32 {
     let [a, b, c, d]: [f32; 4] = from_fn(|i| lanes[i] + lanes[i + 4]);
     (a + c) + (b + d)
 }

@@ -4,10 +4,10 @@ use std::time::{Duration, Instant};
 
 use rayon::prelude::*;
 
-use super::harmonics::Harmonics;
-use super::lanes::vectorized;
-use super::project::{Projection, Rect, Splat, TILE};
-use crate::raster_buffers::pair_capacity;
+use crate::anisotropic::harmonics::Harmonics;
+use crate::raster::buffers::pair_capacity;
+use crate::raster::processor::lanes::vectorized;
+use crate::raster::processor::project::{ProjectedSplat, Projection, Rect, TILE};
 
 /// Gaussians that one task projects.
 const CHUNK: usize = 4096;
@@ -16,12 +16,12 @@ const DIGIT_BITS: u32 = 12;
 const PASSES: u32 = 2;
 
 /// Gaussians that can be projected.
-pub(super) trait Source: Copy + Send + Sync {
+pub(crate) trait Source: Copy + Send + Sync {
     /// Number of Gaussians.
     fn count(&self) -> usize;
 
     /// The splat of Gaussian `i` and its tiles; None where it is not drawn.
-    fn splat(&self, projection: &Projection<'_>, i: usize) -> Option<(Splat, Rect)>;
+    fn splat(&self, projection: &Projection<'_>, i: usize) -> Option<(ProjectedSplat, Rect)>;
 
     /// Colours that depend on the direction.
     fn harmonics(&self) -> Option<Harmonics<'_>> {
@@ -31,7 +31,7 @@ pub(super) trait Source: Copy + Send + Sync {
 
 /// The attributes of isotropic Gaussians, as in [`GaussianBuffers`](crate::GaussianBuffers).
 #[derive(Clone, Copy)]
-pub(super) struct Isotropic<'a> {
+pub(crate) struct Isotropic<'a> {
     pub center_scale: &'a [[f32; 4]],
     pub normal: &'a [[f32; 4]],
     pub color: &'a [[f32; 4]],
@@ -44,14 +44,14 @@ impl Source for Isotropic<'_> {
     }
 
     #[inline(always)]
-    fn splat(&self, projection: &Projection<'_>, i: usize) -> Option<(Splat, Rect)> {
+    fn splat(&self, projection: &Projection<'_>, i: usize) -> Option<(ProjectedSplat, Rect)> {
         projection.isotropic(&self.center_scale[i], &self.normal[i], &self.color[i], &self.canonical[i])
     }
 }
 
 /// The attributes of anisotropic Gaussians, as in [`AnisotropicBuffers`](crate::AnisotropicBuffers).
 #[derive(Clone, Copy)]
-pub(super) struct Anisotropic<'a> {
+pub(crate) struct Anisotropic<'a> {
     pub colors: Harmonics<'a>,
     pub scale_opacity: &'a [[f32; 4]],
     pub rotation: &'a [[f32; 4]],
@@ -63,7 +63,7 @@ impl Source for Anisotropic<'_> {
     }
 
     #[inline(always)]
-    fn splat(&self, projection: &Projection<'_>, i: usize) -> Option<(Splat, Rect)> {
+    fn splat(&self, projection: &Projection<'_>, i: usize) -> Option<(ProjectedSplat, Rect)> {
         projection.anisotropic(&self.colors.center[i], &self.scale_opacity[i], &self.rotation[i])
     }
 
@@ -84,12 +84,12 @@ struct Ranked {
 
 /// Splats and tile lists of one image. Its arrays are used again by the next image.
 #[derive(Debug, Default)]
-pub(super) struct Lists {
+pub(crate) struct Lists {
     /// By Gaussian; old where it is not drawn.
-    pub splats: Vec<Splat>,
+    pub splats: Vec<ProjectedSplat>,
     /// Colours as the camera sees them, by Gaussian where they depend on the direction; old where one is not drawn.
     pub painted: Vec<[f32; 4]>,
-    /// Drawn Gaussians of each chunk.
+    /// RasterImage Gaussians of each chunk.
     visible: Vec<Vec<Ranked>>,
     /// All of them, nearest first.
     order: Vec<Ranked>,
@@ -127,7 +127,7 @@ impl Lists {
 
     fn project(&mut self, projection: &Projection<'_>, gaussians: impl Source) {
         let count = gaussians.count();
-        self.splats.resize(count, Splat::default());
+        self.splats.resize(count, ProjectedSplat::default());
         self.visible.resize(count.div_ceil(CHUNK), Vec::new());
         let chunks = self.splats.par_chunks_mut(CHUNK).zip(&mut self.visible);
         chunks.enumerate().for_each(|(chunk, (splats, visible))| {
@@ -246,7 +246,7 @@ struct ProjectChunk<'a, S> {
     projection: &'a Projection<'a>,
     gaussians: S,
     first: usize,
-    splats: &'a mut [Splat],
+    splats: &'a mut [ProjectedSplat],
     visible: &'a mut Vec<Ranked>,
 }
 

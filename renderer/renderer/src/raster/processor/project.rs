@@ -1,18 +1,18 @@
-//! Gaussians to splats: `raster_project.wgsl` on the processor.
+//! Gaussians to splats: `raster/project.wgsl` on the processor.
 
 use flyrig_gpu::CameraConstants;
 use glam::{Vec2, Vec3, Vec4};
 
-use super::shape::{Shape, rows_along, rows_of};
-use crate::RasterSettings;
-use crate::raster_kernels::{BACKFACING_COSINE, CUT};
+use crate::raster::kernels::{BACKFACING_COSINE, CUT};
+use crate::raster::processor::shape::{Shape, rows_along, rows_of};
+use crate::raster::settings::RasterSettings;
 
 /// Side of a tile, pixels.
-pub(super) const TILE: u32 = super::lanes::LANES as u32;
+pub(crate) const TILE: u32 = crate::raster::processor::lanes::LANES as u32;
 
 /// A Gaussian in the image.
 #[derive(Debug, Clone, Copy, Default)]
-pub(super) struct Splat {
+pub(crate) struct ProjectedSplat {
     /// Centre, pixels.
     pub pixel: Vec2,
     /// Camera-space z, metres.
@@ -27,7 +27,7 @@ pub(super) struct Splat {
 
 /// First and last tile, columns and rows.
 #[derive(Debug, Clone, Copy, Default)]
-pub(super) struct Rect {
+pub(crate) struct Rect {
     pub first: [u16; 2],
     pub last: [u16; 2],
 }
@@ -41,7 +41,7 @@ impl Rect {
 }
 
 /// Camera and settings of one image.
-pub(super) struct Projection<'a> {
+pub(crate) struct Projection<'a> {
     pub camera: CameraConstants,
     pub size: [u32; 2],
     pub settings: &'a RasterSettings,
@@ -57,7 +57,7 @@ impl Projection<'_> {
         normal: &[f32; 4],
         color: &[f32; 4],
         canonical: &[f32; 4],
-    ) -> Option<(Splat, Rect)> {
+    ) -> Option<(ProjectedSplat, Rect)> {
         let finite = |v: &[f32; 4]| Vec4::from(*v).is_finite();
         let [x, y, z, scale] = *center;
         if !(finite(center) && finite(color) && scale > 0.0 && color[3] > 0.0) {
@@ -92,7 +92,7 @@ impl Projection<'_> {
         center: &[f32; 4],
         scale_opacity: &[f32; 4],
         rotation: &[f32; 4],
-    ) -> Option<(Splat, Rect)> {
+    ) -> Option<(ProjectedSplat, Rect)> {
         let world = Vec4::from(*center).truncate();
         let shape = Shape::new(scale_opacity, rotation)?;
         if !(world.is_finite() && shape.opacity > 0.0) {
@@ -106,7 +106,13 @@ impl Projection<'_> {
 
     /// The splat whose covariance before the filter is the product of a matrix of these two rows with its transpose.
     #[inline(always)]
-    fn splat(&self, pixel: Vec2, depth: f32, [row_x, row_y]: [Vec3; 2], opacity: f32) -> Option<(Splat, Rect)> {
+    fn splat(
+        &self,
+        pixel: Vec2,
+        depth: f32,
+        [row_x, row_y]: [Vec3; 2],
+        opacity: f32,
+    ) -> Option<(ProjectedSplat, Rect)> {
         let (xx, xy, yy) = (row_x.dot(row_x), row_x.dot(row_y), row_y.dot(row_y));
         // det(J J^T) by the Cauchy-Binet formula: never negative, no cancellation for thin ellipses.
         let det = row_x.cross(row_y).length_squared();
@@ -136,6 +142,6 @@ impl Projection<'_> {
         let rect = Rect { first: [tile(low.x), tile(low.y)], last: [tile(high.x), tile(high.y)] };
         let scale = 0.5 * std::f32::consts::LOG2_E / filtered_det;
         let conic = [yy * scale, -2.0 * xy * scale, xx * scale];
-        Some((Splat { pixel, depth, log2_opacity, conic, reach_y: extent.y }, rect))
+        Some((ProjectedSplat { pixel, depth, log2_opacity, conic, reach_y: extent.y }, rect))
     }
 }

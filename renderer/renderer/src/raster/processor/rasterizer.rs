@@ -6,27 +6,30 @@ use flyrig_gpu::CameraConstants;
 use flyrig_types::Camera;
 use rayon::prelude::*;
 
-use super::blend::{BlendTile, Tile};
-use super::harmonics::Harmonics;
-use super::lanes::{LANES, vectorized};
-use super::lists::{Anisotropic, Isotropic, Lists};
-use super::project::{Projection, TILE};
-use crate::raster_settings::{Latest, tile_range};
-use crate::{Gaussians, HarmonicOrder, Outputs, RasterSettings, RasterStats, RenderTarget};
+use crate::anisotropic::buffers::Gaussians;
+use crate::anisotropic::harmonics::Harmonics;
+use crate::anisotropic::order::HarmonicOrder;
+use crate::buffers::RenderTarget;
+use crate::raster::processor::blend::{BlendTile, BlendedTile};
+use crate::raster::processor::lanes::{LANES, vectorized};
+use crate::raster::processor::lists::{Anisotropic, Isotropic, Lists};
+use crate::raster::processor::project::{Projection, TILE};
+use crate::raster::settings::{Latest, tile_range};
+use crate::raster::settings::{Outputs, RasterSettings, RasterStats};
 
 /// [`Rasterizer`](crate::Rasterizer) on the processor: draws when an image is recorded.
 #[derive(Debug, Default)]
 pub(crate) struct ProcessorRasterizer {
-    pub(super) lists: Lists,
+    pub(crate) lists: Lists,
     /// The image that was drawn last.
-    pub(super) latest: Option<Drawn>,
+    pub(crate) latest: Option<RasterImage>,
     overflowed_images: u32,
     blend_time: Duration,
 }
 
 /// Parameters of an image that its derivative needs.
 #[derive(Debug, Clone)]
-pub(crate) struct Drawn {
+pub(crate) struct RasterImage {
     pub camera: CameraConstants,
     pub size: [u32; 2],
     pub gaussians: usize,
@@ -75,7 +78,7 @@ impl ProcessorRasterizer {
         };
         let Some((first_tile, blended)) = tiles else { return };
         let (gaussians, order, settings) = (gaussians.count(), gaussians.order(), *settings);
-        self.latest = Some(Drawn { camera: constants, size, gaussians, order, settings, first_tile, blended });
+        self.latest = Some(RasterImage { camera: constants, size, gaussians, order, settings, first_tile, blended });
     }
 
     /// Blends the lists into the images. Returns the first tile that was blended, and columns and rows of them.
@@ -136,7 +139,7 @@ impl ProcessorRasterizer {
     }
 
     pub(crate) fn latest(&self) -> Option<Latest> {
-        let Drawn { size, gaussians, order, settings, blended, .. } = self.latest.as_ref()?;
+        let RasterImage { size, gaussians, order, settings, blended, .. } = self.latest.as_ref()?;
         let outputs = settings.outputs;
         Some(Latest { gaussians: *gaussians, order: *order, size: *size, blended: *blended, outputs })
     }
@@ -173,7 +176,7 @@ impl Band<'_> {
     }
 
     /// Writes a tile whose first pixel is in column `left`.
-    fn write(&mut self, tile: &Tile, width: usize, left: usize) {
+    fn write(&mut self, tile: &BlendedTile, width: usize, left: usize) {
         let columns = LANES.min(width - left);
         let three = |sums: &[[[f32; LANES]; LANES]; 3], row: usize, lane: usize| {
             [sums[0][row][lane], sums[1][row][lane], sums[2][row][lane], tile.coverage[row][lane]]

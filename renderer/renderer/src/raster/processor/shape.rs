@@ -1,11 +1,11 @@
-//! Shape of an anisotropic Gaussian: `raster_axes.wgsl` on the processor.
+//! Shape of an anisotropic Gaussian: `anisotropic/axes.wgsl` on the processor.
 
 use flyrig_gpu::CameraConstants;
 use glam::{Mat3, Mat4, Quat, Vec2, Vec3, Vec4};
 
 /// Scales, opacity and rotation, as far as they can be drawn.
 #[derive(Debug, Clone, Copy)]
-pub(super) struct Shape {
+pub(crate) struct Shape {
     /// Standard deviations along the axes, metres.
     pub scale_m: Vec3,
     pub opacity: f32,
@@ -38,18 +38,18 @@ impl Shape {
 
 /// Camera from world.
 #[inline(always)]
-pub(super) fn camera_rotation(camera: &CameraConstants) -> Mat3 {
+pub(crate) fn camera_rotation(camera: &CameraConstants) -> Mat3 {
     Mat3::from_mat4(Mat4::from_cols_array_2d(&camera.camera_from_world))
 }
 
 /// Rows of the projection's Jacobian, whose columns are d/dx, d/dy and d/dz.
 #[inline(always)]
-pub(super) fn rows_of(&[dx, dy, dz]: &[Vec2; 3]) -> [Vec3; 2] {
+pub(crate) fn rows_of(&[dx, dy, dz]: &[Vec2; 3]) -> [Vec3; 2] {
     [Vec3::new(dx.x, dy.x, dz.x), Vec3::new(dx.y, dy.y, dz.y)]
 }
 
 /// [`rows_of`] in the basis of `axes`.
 #[inline(always)]
-pub(super) fn rows_along(jacobian: &[Vec2; 3], axes: &Mat3) -> [Vec3; 2] {
+pub(crate) fn rows_along(jacobian: &[Vec2; 3], axes: &Mat3) -> [Vec3; 2] {
     rows_of(jacobian).map(|row| Vec3::new(axes.x_axis.dot(row), axes.y_axis.dot(row), axes.z_axis.dot(row)))
 }

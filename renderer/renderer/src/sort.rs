@@ -1,0 +1,4 @@
+//! Stable radix sort and prefix sum on the device.
+
+pub(crate) mod radix;
+pub(crate) mod scan;
