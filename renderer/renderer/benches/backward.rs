@@ -80,7 +80,8 @@ struct Row {
     forward: f64,
     backward: f64,
     error: f64,
-    /// Of the loss along the unit gradient: by the derivative, and by a finite step through all jumps.
+    /// Returns the slopes of the loss along the unit gradient: by the derivative, and by a finite step through all
+    /// discontinuities.
     slope: Option<(f64, f64)>,
 }
 

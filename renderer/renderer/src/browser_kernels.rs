@@ -1,4 +1,4 @@
-//! Kernels for programs that draw with them through another host than this crate: the web page does in browsers with WebGPU.
+//! Kernels for other hosts than this crate: the web page draws with them in browsers with WebGPU.
 
 use std::mem::offset_of;
 
@@ -10,21 +10,23 @@ use crate::raster::settings::{Outputs, RasterSettings};
 use crate::sort::radix::{BLOCK, DIGIT_BITS, KEY_BITS, sort_wgsl};
 use crate::sort::scan::{SEGMENTS, scan_wgsl};
 
-/// WGSL and numbers for a host that draws Gaussians as [`crate::Rasterizer`] does on a device, colour and alpha only: isotropic ones, or
-/// anisotropic ones of one colour each, which the host hands to `blend` in place of what `anisotropic/paint.wgsl` would write.
-/// Bindings and their order are those of `raster/device.rs`; no entry point binds more than 8 storage buffers.
+/// WGSL and constants for a host that draws colour and alpha of Gaussians as [`crate::Rasterizer`] does on a device:
+/// isotropic ones, or anisotropic ones of one colour each, which the host passes to `blend` in place of the output of
+/// `anisotropic/paint.wgsl`. Bindings and their order are those of `raster/device.rs`; no entry point binds more than 8
+/// storage buffers.
 #[derive(Debug, Clone)]
 pub struct BrowserKernels {
     /// Name and WGSL of each module.
     pub modules: [(&'static str, String); 6],
-    /// Name and value of the numbers that the host needs: workgroup sizes, room for pairs, settings of the drawing.
+    /// Name and value of the constants that the host needs: workgroup sizes, capacity for pairs, settings of the
+    /// rendering.
     pub numbers: [(&'static str, f64); 11],
     /// Name and byte offset of the fields of an image's constants, and their size. The matrix of the camera is first.
     pub frame: [(&'static str, usize); 13],
 }
 
 impl BrowserKernels {
-    /// Returns the kernels for graphics processors.
+    /// Generates the kernels for GPUs.
     #[must_use]
     pub fn new() -> Self {
         let tile = Tile::HARDWARE;

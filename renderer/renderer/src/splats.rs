@@ -1,19 +1,19 @@
-//! Isotropic Gaussians in memory, for programs that take them out of a session.
+//! Gaussians in memory, for programs that read them back from a session.
 
 use flyrig_gpu::{GpuContext, GpuError};
 
 use crate::buffers::GaussianBuffers;
 
-/// One Gaussian as a splat file knows it.
+/// Gaussian with the attributes of a splat file.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Splat {
-    /// Metres.
+    /// World position, metres.
     pub position: [f32; 3],
-    /// Unit normal of the surface.
+    /// World unit normal of the surface.
     pub normal: [f32; 3],
     /// Linear RGB.
     pub color: [f32; 3],
-    /// 0..=1.
+    /// Opacity in 0..=1.
     pub opacity: f32,
     /// Standard deviations along the axes, metres.
     pub scale_m: [f32; 3],
@@ -21,7 +21,7 @@ pub struct Splat {
     pub rotation_wxyz: [f32; 4],
 }
 
-/// Waits for the GPU and copies the Gaussians out (isotropic, no rotation).
+/// Waits for the GPU and reads the Gaussians back (isotropic, no rotation).
 ///
 /// # Errors
 /// [`GpuError::Lost`].

@@ -1,4 +1,4 @@
-//! Anisotropic Gaussians: what they are made of, and derivatives with respect to all of it.
+//! Buffers of anisotropic Gaussians and of derivatives with respect to all their attributes.
 
 use flyrig_gpu::{GpuContext, GpuError, StorageBuffer};
 use wgpu::CommandEncoder;
@@ -10,9 +10,9 @@ use crate::schema::{self, GaussianElement};
 /// Gaussians with three scales, a rotation, an opacity, and a colour that depends on the direction; a buffer for each of
 /// [`ANISOTROPIC_ATTRIBUTES`](crate::ANISOTROPIC_ATTRIBUTES).
 ///
-/// The covariance is `R diag(scale²) R^T`. The colour is the sum of the real spherical harmonics of the direction from the
-/// camera to the centre, with the signs of the 3D Gaussian Splatting reference code and without its offset of 0.5, times
-/// their coefficients; what is below 0 becomes 0. A Gaussian with any number that is not finite, a scale or the opacity not
+/// The covariance is `R diag(scale²) R^T`. The colour is the sum of the real spherical harmonics of the direction from
+/// the camera to the centre, with the signs of the 3D Gaussian Splatting reference code and without its offset of 0.5,
+/// times their coefficients; negative values become 0. A Gaussian with a non-finite number, a scale or opacity not
 /// above 0, or a quaternion whose length is not within 1e-15 to 1e15 is not drawn.
 #[derive(Debug)]
 pub struct AnisotropicBuffers {
@@ -22,13 +22,13 @@ pub struct AnisotropicBuffers {
     pub scale_opacity: StorageBuffer<GaussianElement>,
     /// Quaternion x, y, z, w of any length: world from the Gaussian's axes.
     pub rotation: StorageBuffer<GaussianElement>,
-    /// Coefficients of linear RGB; w unused. Those of one Gaussian follow each other.
+    /// Coefficients of linear RGB; w unused. Those of one Gaussian are consecutive.
     pub harmonics: StorageBuffer<GaussianElement>,
     order: HarmonicOrder,
 }
 
 impl AnisotropicBuffers {
-    /// Room for `count` Gaussians, all zero.
+    /// Allocates buffers for `count` Gaussians, all zero.
     ///
     /// # Errors
     /// [`GpuError::TooLarge`].
@@ -42,19 +42,19 @@ impl AnisotropicBuffers {
         })
     }
 
-    /// Number of Gaussians.
+    /// Returns the number of Gaussians.
     #[must_use]
     pub fn count(&self) -> usize {
         self.center.len()
     }
 
-    /// Order of the colours.
+    /// Returns the harmonic order of the colours.
     #[must_use]
     pub fn order(&self) -> HarmonicOrder {
         self.order
     }
 
-    /// The buffers in the order of [`ANISOTROPIC_ATTRIBUTES`](crate::ANISOTROPIC_ATTRIBUTES).
+    /// Returns the buffers in the order of [`ANISOTROPIC_ATTRIBUTES`](crate::ANISOTROPIC_ATTRIBUTES).
     #[must_use]
     pub fn attributes(&self) -> [&StorageBuffer<GaussianElement>; 4] {
         [&self.center, &self.scale_opacity, &self.rotation, &self.harmonics]
@@ -65,18 +65,18 @@ impl AnisotropicBuffers {
 /// [`Self::clear`].
 #[derive(Debug)]
 pub struct AnisotropicGradients {
-    /// dL/d world centre, per metre; w: blending weight in the pixels that had a gradient (0: it cannot matter).
+    /// dL/d world centre, per metre; w: blending weight in the pixels that had a gradient (0: no influence).
     pub center: StorageBuffer<GaussianElement>,
     /// dL/d scales, per metre; w: dL/d opacity, 0 where it is above 1.
     pub scale_opacity: StorageBuffer<GaussianElement>,
-    /// dL/d quaternion as it is stored. It has no part along the quaternion: the length does not matter.
+    /// dL/d stored quaternion. It is orthogonal to the quaternion, whose length has no influence.
     pub rotation: StorageBuffer<GaussianElement>,
     /// dL/d coefficients, 0 where the colour is clamped at 0; w: 0.
     pub harmonics: StorageBuffer<GaussianElement>,
 }
 
 impl AnisotropicGradients {
-    /// For `count` Gaussians, all zero.
+    /// Allocates derivatives of `count` Gaussians, all zero.
     ///
     /// # Errors
     /// [`GpuError::TooLarge`].
@@ -86,12 +86,12 @@ impl AnisotropicGradients {
         Ok(Self { center, scale_opacity, rotation, harmonics })
     }
 
-    /// Records setting everything to zero.
+    /// Records the clearing of all buffers.
     pub fn clear(&self, encoder: &mut CommandEncoder) {
         self.attributes().into_iter().for_each(|buffer| buffer.encode_clear(encoder));
     }
 
-    /// The buffers in the order of [`ANISOTROPIC_ATTRIBUTES`](crate::ANISOTROPIC_ATTRIBUTES).
+    /// Returns the buffers in the order of [`ANISOTROPIC_ATTRIBUTES`](crate::ANISOTROPIC_ATTRIBUTES).
     #[must_use]
     pub fn attributes(&self) -> [&StorageBuffer<GaussianElement>; 4] {
         [&self.center, &self.scale_opacity, &self.rotation, &self.harmonics]
@@ -103,13 +103,13 @@ impl AnisotropicGradients {
 pub enum Gaussians<'a> {
     /// Surface Gaussians of one scale and one colour each.
     Isotropic(&'a GaussianBuffers),
-    /// Gaussians of three scales and colours by direction. They have no normals and no canonical positions: none is culled, and
-    /// [`RenderTarget::canonical`](crate::RenderTarget::canonical) keeps its content.
+    /// Gaussians of three scales and colours by direction. They have neither normals nor canonical positions: none is
+    /// culled, and [`RenderTarget::canonical`](crate::RenderTarget::canonical) keeps its content.
     Anisotropic(&'a AnisotropicBuffers),
 }
 
 impl Gaussians<'_> {
-    /// Number of Gaussians.
+    /// Returns the number of Gaussians.
     #[must_use]
     pub fn count(&self) -> usize {
         match self {
@@ -118,7 +118,7 @@ impl Gaussians<'_> {
         }
     }
 
-    /// Order of the colours; None for isotropic Gaussians.
+    /// Returns the harmonic order of the colours; `None` for isotropic Gaussians.
     pub(crate) fn order(&self) -> Option<HarmonicOrder> {
         match self {
             Self::Isotropic(_) => None,

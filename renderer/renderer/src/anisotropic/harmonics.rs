@@ -1,5 +1,5 @@
-//! Colour by direction and its derivatives: `anisotropic/harmonics.wgsl`, `anisotropic/paint.wgsl` and `anisotropic/paint_backward.wgsl` on the
-//! processor.
+//! Colours by direction and their derivatives: `anisotropic/harmonics.wgsl`, `anisotropic/paint.wgsl` and
+//! `anisotropic/paint_backward.wgsl` on the processor.
 
 use glam::{Vec3, Vec4};
 
@@ -9,28 +9,28 @@ const C2_XY: f32 = 1.092_548_4;
 const C2_ZZ: f32 = 0.315_391_57;
 const C2_XX: f32 = 0.546_274_2;
 
-/// Coefficients of all Gaussians, and where they are seen from.
+/// Coefficients of all Gaussians and the position they are seen from.
 #[derive(Clone, Copy)]
 pub(crate) struct Harmonics<'a> {
     pub center: &'a [[f32; 4]],
-    /// Those of one Gaussian follow each other.
+    /// Coefficients; those of one Gaussian are consecutive.
     pub harmonics: &'a [[f32; 4]],
-    /// Elements of one Gaussian: 1, 4 or 9.
+    /// Coefficients per Gaussian: 1, 4 or 9.
     pub coefficients: usize,
     /// World position of the camera.
     pub eye: Vec3,
 }
 
 impl Harmonics<'_> {
-    /// Colour of Gaussian `i`; None where it is not finite.
+    /// Returns the colour of Gaussian `i`; `None` where it is not finite.
     pub fn color(&self, i: usize) -> Option<[f32; 4]> {
         let direction = (Vec4::from(self.center[i]).truncate() - self.eye).normalize_or(Vec3::Z);
         let color = unclamped_color(self.of(i), direction);
         color.is_finite().then(|| color.max(Vec3::ZERO).extend(0.0).to_array())
     }
 
-    /// Adds the derivatives of Gaussian `i`, given dL/d its colour, to those with respect to its centre and its coefficients.
-    /// Nothing flows where a channel is clamped at 0.
+    /// Adds the derivatives of Gaussian `i`, given dL/d its colour, to those with respect to its centre and its
+    /// coefficients. A channel that is clamped at 0 contributes nothing.
     pub fn add_backward(&self, i: usize, d_color: Vec3, center_out: &mut [f32; 4], harmonics_out: &mut [[f32; 4]]) {
         let coefficients = self.of(i);
         let sight = Vec4::from(self.center[i]).truncate() - self.eye;
@@ -56,7 +56,7 @@ impl Harmonics<'_> {
     }
 }
 
-/// Values of the harmonics in the unit direction `d`.
+/// Evaluates the harmonics in the unit direction `d`.
 fn basis(d: Vec3) -> [f32; 9] {
     let Vec3 { x, y, z } = d;
     [
@@ -76,7 +76,7 @@ fn unclamped_color(coefficients: &[[f32; 4]], d: Vec3) -> Vec3 {
     coefficients.iter().zip(basis(d)).map(|(c, value)| Vec4::from(*c).truncate() * value).sum()
 }
 
-/// dL/d direction, its part along the direction included, given dL/d colour.
+/// Returns dL/d direction, including its part along the direction, given dL/d colour.
 fn direction_slope(coefficients: &[[f32; 4]], d: Vec3, d_color: Vec3) -> Vec3 {
     let by = |k: usize| coefficients.get(k).map_or(0.0, |c| d_color.dot(Vec4::from(*c).truncate()));
     let (xy, yz, zz) = (C2_XY * by(4), -C2_XY * by(5), 2.0 * C2_ZZ * by(6));

@@ -1,13 +1,13 @@
 //! Order of the spherical harmonics of a colour.
 
-/// Order up to which the colours of a scene depend on the direction.
+/// Order of the harmonics by which the colours of a scene depend on the direction.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
 pub enum HarmonicOrder {
     /// One colour for all directions.
     Zero,
-    /// Linear in the direction.
+    /// Colours linear in the direction.
     One,
-    /// Quadratic in the direction.
+    /// Colours quadratic in the direction.
     Two,
 }
 
@@ -15,7 +15,7 @@ impl HarmonicOrder {
     /// All orders, the lowest first.
     pub const ALL: [Self; 3] = [Self::Zero, Self::One, Self::Two];
 
-    /// Coefficients of one colour channel.
+    /// Returns the number of coefficients of one colour channel.
     #[must_use]
     pub const fn coefficients(self) -> usize {
         match self {

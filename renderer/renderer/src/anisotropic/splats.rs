@@ -15,27 +15,27 @@ pub struct AnisotropicSplats {
     pub scale_opacity: Vec<GaussianElement>,
     /// Quaternion x, y, z, w of any length: world from the Gaussian's axes.
     pub rotation: Vec<GaussianElement>,
-    /// Coefficients of linear RGB; w unused. Those of one Gaussian follow each other.
+    /// Coefficients of linear RGB; w unused. Those of one Gaussian are consecutive.
     pub harmonics: Vec<GaussianElement>,
-    /// Order of the colours.
+    /// Harmonic order of the colours.
     pub order: HarmonicOrder,
 }
 
 impl AnisotropicSplats {
-    /// No Gaussians.
+    /// Returns an empty list.
     #[must_use]
     pub fn empty(order: HarmonicOrder) -> Self {
         Self { center: vec![], scale_opacity: vec![], rotation: vec![], harmonics: vec![], order }
     }
 
-    /// Number of Gaussians that have all attributes.
+    /// Returns the number of Gaussians that have all attributes.
     #[must_use]
     pub fn count(&self) -> usize {
         let rows = self.center.len().min(self.scale_opacity.len()).min(self.rotation.len());
         rows.min(self.harmonics.len() / self.order.coefficients())
     }
 
-    /// Waits for the GPU and copies the Gaussians out.
+    /// Waits for the GPU and reads the Gaussians back.
     ///
     /// # Errors
     /// [`GpuError::Lost`].
@@ -46,7 +46,7 @@ impl AnisotropicSplats {
         Ok(Self { center, scale_opacity, rotation, harmonics, order: buffers.order() })
     }
 
-    /// Copies the Gaussians into buffers of their own.
+    /// Uploads the Gaussians into new buffers.
     ///
     /// # Errors
     /// [`GpuError::TooLarge`].

@@ -9,13 +9,13 @@ use crate::sort::scan::run;
 
 const WGSL: &str = include_str!("color_means.wgsl");
 
-/// Children of a Gaussian that count.
+/// Largest number of children of a Gaussian that are averaged.
 const MAX_CHILDREN: usize = 10_000;
 
-/// Gives coarse Gaussians the mean colour and opacity of the fine ones that they stand for.
+/// Transfer of mean colours and opacities of fine Gaussians to the coarse ones that represent them.
 #[derive(Debug)]
 pub struct ColorMeans {
-    /// None on the processor.
+    /// `None` on the processor.
     kernel: Option<ComputeKernel>,
     first_child: StorageBuffer<u32>,
     children: StorageBuffer<u32>,
@@ -23,8 +23,8 @@ pub struct ColorMeans {
 }
 
 impl ColorMeans {
-    /// `first_child` holds for each coarse Gaussian where its part of `children` (indices of fine ones) begins, and at
-    /// the end where the last one's ends. At most 10,000 children count.
+    /// Uploads the children. `first_child` holds the start of each coarse Gaussian's part of `children` (indices of fine
+    /// ones), followed by the end of the last one's. At most 10,000 children are averaged.
     ///
     /// # Errors
     /// [`GpuError::TooLarge`].
@@ -37,7 +37,8 @@ impl ColorMeans {
         })
     }
 
-    /// Records the means of `fine` into `coarse`; `rate` is their share there, 0..=1, and what was there keeps the rest.
+    /// Records the means of `fine` into `coarse`; `rate` in 0..=1 is their share, and the previous colours keep the
+    /// remainder.
     pub fn encode(
         &self,
         gpu: &GpuContext,
@@ -55,7 +56,7 @@ impl ColorMeans {
         run(gpu, &mut pass, kernel, &resources, dispatch_1d(coarse.len() as u32, 64));
     }
 
-    /// The kernel on the processor.
+    /// Computes the means on the processor.
     fn mean_colors(&self, fine: &StorageBuffer<[f32; 4]>, coarse: &StorageBuffer<[f32; 4]>, rate: f32) {
         let (Some(first_child), Some(children)) = (self.first_child.slice(), self.children.slice()) else { return };
         let (Some(fine), Some(mut coarse)) = (fine.slice(), coarse.slice_mut()) else { return };

@@ -1,4 +1,4 @@
-//! Buffers of direct appearance and the recording of one frame.
+//! Buffers of direct appearance and the recording of an update.
 
 use flyrig_body::{DeformationGraph, SurfaceGaussians};
 use flyrig_gpu::{CameraConstants, GpuContext, GpuError, GpuTimer, StorageBuffer, dispatch_1d};
@@ -14,12 +14,12 @@ use crate::color::linear_from_srgb;
 
 const KEPT: &str = "observations of a view";
 
-/// Paints every Gaussian from the images of this instant and a memory of earlier ones.
+/// Painter of every Gaussian from the images of one instant and a memory of earlier ones.
 ///
-/// Buffers and pipelines are made once.
+/// Buffers and pipelines are created once.
 #[derive(Debug)]
 pub struct DirectAppearance {
-    /// None on the processor.
+    /// `None` on the processor.
     device: Option<DeviceKernels>,
     graph: GraphBuffers,
     linear_from_srgb: StorageBuffer<f32>,
@@ -27,27 +27,27 @@ pub struct DirectAppearance {
     kept: Vec<StorageBuffer<[f32; 4]>>,
     /// Sum of weight times linear RGB, sum of weights.
     seen: StorageBuffer<[f32; 4]>,
-    /// Sum of Eq. 6 weights, exp(-k d) of the best view.
+    /// Sum of Eq. 6 weights; exp(-k d) of the best view.
     quality: StorageBuffer<[f32; 2]>,
     /// Accumulated linear RGB and its weight.
     memory: StorageBuffer<[f32; 4]>,
     forget: bool,
 }
 
-/// The kernels on the device, and what they are uploaded.
+/// Kernels on the device and the buffers of their constants.
 #[derive(Debug)]
 struct DeviceKernels {
     kernels: AppearanceKernels,
     settings: Buffer,
-    /// One a view.
+    /// One per view.
     cameras: Vec<Buffer>,
 }
 
 impl DirectAppearance {
-    /// For the Gaussians and graph of one body and at most `max_views` images a frame.
+    /// Creates the buffers for the Gaussians and graph of one body and at most `max_views` images per frame.
     ///
     /// # Errors
-    /// [`AppearanceError::Graph`] when the two do not fit, [`AppearanceError::Gpu`].
+    /// [`AppearanceError::Graph`] where the two do not fit, [`AppearanceError::Gpu`].
     pub fn new(
         gpu: &GpuContext,
         gaussians: &SurfaceGaussians,
@@ -82,8 +82,8 @@ impl DirectAppearance {
         })
     }
 
-    /// Records the painting of [`GaussianBuffers::color`] (opacity 1) and uploads the cameras. Any number of views
-    /// up to the maximum will do; a camera that gave no image is left out of `views`.
+    /// Records the painting of [`GaussianBuffers::color`] (opacity 1) and uploads the cameras. `views` may have any
+    /// number of views up to the maximum; a camera without an image is left out.
     ///
     /// Submit the encoder before the next update: uploads take effect at the submission.
     ///
@@ -100,7 +100,7 @@ impl DirectAppearance {
         self.update_timed(gpu, encoder, gaussians, views, settings, None)
     }
 
-    /// [`Self::update`] with the time of its stages: `observe`, `gather`, `diffuse`, `paint`.
+    /// Records an update as [`Self::update`] does and measures its stages: `observe`, `gather`, `diffuse`, `paint`.
     ///
     /// # Errors
     /// As [`Self::update`].
@@ -189,7 +189,7 @@ impl DirectAppearance {
         Ok(())
     }
 
-    /// The kernels on the processor.
+    /// Runs the update on the processor.
     fn update_on_processor(&self, gaussians: &GaussianBuffers, views: &[ViewInput<'_>], settings: &SettingsConstants) {
         let (Some(mut seen), Some(mut quality)) = (self.seen.slice_mut(), self.quality.slice_mut()) else { return };
         let Some(linear) = self.linear_from_srgb.slice() else { return };
@@ -208,7 +208,7 @@ impl DirectAppearance {
         processor::paint(settings, &self.graph, (&seen, &quality), &mut memory, &mut color);
     }
 
-    /// From the next update on keeps what each view saw, for [`Self::observations`].
+    /// Keeps the observations of each view from the next update on, for [`Self::observations`].
     ///
     /// # Errors
     /// [`GpuError::TooLarge`].
@@ -219,7 +219,7 @@ impl DirectAppearance {
         Ok(())
     }
 
-    /// What the last update, which must have been submitted, found out. `views` is the number of views it was given;
+    /// Reads back the observations of the last update, which must have been submitted. `views` is its number of views;
     /// their lists are empty without [`Self::keep_observations`].
     ///
     /// # Errors
@@ -246,7 +246,7 @@ impl DirectAppearance {
     /// Resumes from the colour memory of an earlier appearance of the same Gaussians.
     ///
     /// # Errors
-    /// [`AppearanceError::GaussianCount`] when it is of another number of Gaussians.
+    /// [`AppearanceError::GaussianCount`] for another number of Gaussians.
     pub fn resume(&mut self, gpu: &GpuContext, memory: &[[f32; 4]]) -> Result<(), AppearanceError> {
         let (expected, found) = (self.seen.len(), memory.len());
         if found != expected {

@@ -1,4 +1,4 @@
-//! The backward rasteriser on the device.
+//! Backward rasteriser on the device.
 
 use std::sync::OnceLock;
 
@@ -21,7 +21,7 @@ use crate::sort::scan::run;
 #[derive(Debug)]
 pub(crate) struct DeviceBackward {
     place: ComputeKernel,
-    /// By whether depth was drawn, as all that blend.
+    /// Without and with depth, as in all arrays of blending kernels.
     blend: [ComputeKernel; 2],
     sum: ComputeKernel,
     project: [ComputeKernel; 2],
@@ -30,9 +30,9 @@ pub(crate) struct DeviceBackward {
     places: StorageBuffer<[u32; 4]>,
     tile_limits: StorageBuffer<u32>,
     pair_sums: StorageBuffer<[[f32; 4]; 3]>,
-    /// Elements of `pair_sums`, in x; made again with it.
+    /// Number of elements of `pair_sums`, in x; reallocated with it.
     room: StorageBuffer<[u32; 4]>,
-    /// By Gaussian.
+    /// Sums per Gaussian.
     sums: StorageBuffer<[[f32; 4]; 3]>,
 }
 
@@ -40,7 +40,7 @@ pub(crate) struct DeviceBackward {
 struct AnisotropicKernels {
     blend: [ComputeKernel; 2],
     project: ComputeKernel,
-    /// By order.
+    /// One kernel per harmonic order.
     paint: [ComputeKernel; 3],
 }
 
@@ -59,7 +59,7 @@ fn kernel(gpu: &GpuContext, entry: &str, source: &str) -> ComputeKernel {
     ComputeKernel::new(gpu, entry, &[source], entry)
 }
 
-/// The image whose derivative is recorded.
+/// Image whose derivative is recorded.
 struct View<'a> {
     gpu: &'a GpuContext,
     rasterizer: &'a DeviceRasterizer,

@@ -2,18 +2,18 @@
 
 use flyrig_gpu::GpuError;
 
-/// Why there is no derivative.
+/// Reason why no derivative was recorded.
 #[derive(Debug, thiserror::Error)]
 pub enum BackwardError {
-    /// Buffers must grow and cannot.
+    /// A buffer would exceed the adapter's limits, or the device is lost.
     #[error(transparent)]
     Gpu(#[from] GpuError),
-    /// A buffer does not belong to the image that was drawn last.
+    /// A buffer does not fit the image rendered last.
     #[error("{what}: {found} elements where the image drawn last needs {needed}; make it for that image")]
     Buffer {
-        /// Which buffer.
+        /// Name of the buffer.
         what: &'static str,
-        /// Its elements.
+        /// Elements found.
         found: usize,
         /// Elements needed.
         needed: usize,

@@ -1,21 +1,21 @@
-//! Derivatives with respect to images and Gaussians: what the backward rasteriser reads and writes.
+//! Derivatives with respect to images (input of the backward rasteriser) and to Gaussians (its output).
 
 use flyrig_gpu::{GpuContext, GpuError, StorageBuffer};
 use wgpu::CommandEncoder;
 
-/// Derivatives of a loss L with respect to the images of one view, row by row, one element a pixel. A pixel with a
-/// number that is not finite counts as zero; so does one where nothing was drawn.
+/// Derivatives of a loss L with respect to the images of one view, row by row, one element per pixel. Pixels with a
+/// non-finite number and pixels without any Gaussian count as zero.
 #[derive(Debug)]
 pub struct ImageGradients {
     /// dL/d of the premultiplied linear red, green, blue, and of alpha ([`crate::RenderTarget::color`]).
     pub color: StorageBuffer<[f32; 4]>,
-    /// x: dL/d [`crate::RenderTarget::depth`], per metre (ignored when the forward pass drew no depth); yzw: three numbers
-    /// that the pixel hands to its Gaussians, see [`Carry`].
+    /// x: dL/d [`crate::RenderTarget::depth`], per metre (ignored where the forward pass wrote no depth); yzw: three
+    /// numbers that the pixel passes to its Gaussians, see [`Carry`].
     pub depth_carry: StorageBuffer<[f32; 4]>,
 }
 
 impl ImageGradients {
-    /// For images of `width` x `height` pixels, all zero.
+    /// Allocates derivatives of images of `width` x `height` pixels, all zero.
     ///
     /// # Errors
     /// [`GpuError::TooLarge`].
@@ -31,26 +31,27 @@ impl ImageGradients {
 /// Treatment of the numbers that a pixel passes to its Gaussians, weighted by their blending weights.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Carry {
-    /// They are added up. With dL/d (red, green, blue) as the numbers, the sums are dL/d the Gaussian's colour.
+    /// Sum. With dL/d (red, green, blue) as the numbers, the sums are dL/d the Gaussian's colour.
     Sum,
-    /// They are the entries (xx, xy, yy) of a 2x2 matrix C in the image, per square pixel; their sum is lifted to
-    /// the world, `J^T C J` with J = d pixel / d centre. With C from the image's own slopes this is the
-    /// Gauss-Newton matrix of the pixels as if all that is seen in one moved together (Lucas and Kanade 1981).
+    /// Lift to the world of the sum of 2x2 matrices C in the image, whose entries (xx, xy, yy) per square pixel the
+    /// numbers are: `J^T C J` with J = d pixel / d centre. With C from the image's own gradient this is the
+    /// Gauss-Newton matrix of the pixels under the assumption that everything visible in a pixel moves together (Lucas
+    /// and Kanade 1981).
     Lift,
 }
 
 /// Derivatives with respect to the Gaussians, summed over the views since [`Self::clear`].
 #[derive(Debug)]
 pub struct GaussianGradients {
-    /// xyz: dL/d world centre, per metre; w: blending weight in the pixels that had a gradient (0: it cannot matter).
+    /// xyz: dL/d world centre, per metre; w: blending weight in the pixels that had a gradient (0: no influence).
     pub center: StorageBuffer<[f32; 4]>,
-    /// Two elements a Gaussian. [`Carry::Sum`]: the three numbers, the rest 0. [`Carry::Lift`]: entries xx, xy, xz,
+    /// Two elements per Gaussian. [`Carry::Sum`]: the three numbers, the rest 0. [`Carry::Lift`]: entries xx, xy, xz,
     /// yy | yz, zz, 0, 0 of the symmetric matrix, per square metre.
     pub carried: StorageBuffer<[f32; 4]>,
 }
 
 impl GaussianGradients {
-    /// For `count` Gaussians, all zero.
+    /// Allocates derivatives of `count` Gaussians, all zero.
     ///
     /// # Errors
     /// [`GpuError::TooLarge`].
@@ -61,7 +62,7 @@ impl GaussianGradients {
         })
     }
 
-    /// Records setting everything to zero.
+    /// Records the clearing of all buffers.
     pub fn clear(&self, encoder: &mut CommandEncoder) {
         self.center.encode_clear(encoder);
         self.carried.encode_clear(encoder);

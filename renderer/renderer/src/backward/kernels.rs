@@ -1,4 +1,4 @@
-//! WGSL of the backward rasteriser's kernels and the numbers they are compiled with.
+//! WGSL of the backward rasteriser's kernels and its compile-time constants.
 
 use flyrig_gpu::CAMERA_WGSL;
 
@@ -15,12 +15,12 @@ const PAINT_WGSL: &str = include_str!("../anisotropic/paint_backward.wgsl");
 
 /// Bytes of `struct PairSum`.
 pub(crate) const PAIR_SUM_BYTES: u64 = 48;
-/// Pairs that one tile's invocations walk over; each costs them about two iterations, and Mesa's software adapter ends all loops
-/// of an invocation after 65,535 iterations together, without a word.
+/// Largest number of pairs that one tile's invocations walk over. Each pair costs about two iterations, and Mesa's
+/// software adapter silently ends an invocation after 65,535 iterations of all its loops.
 const MAX_LIST: u32 = 24_576;
-/// Tiles that one Gaussian adds up, for the same reason.
+/// Largest number of tiles whose sums are added for one Gaussian, for the same reason.
 const MAX_TILES: u32 = 60_000;
-/// Bytes of workgroup memory for partial sums; WebGPU promises 16 KiB.
+/// Bytes of workgroup memory for partial sums; WebGPU guarantees 16 KiB.
 const PARTIAL_BYTES: u32 = 12 << 10;
 
 pub(crate) fn places_wgsl() -> String {
@@ -28,7 +28,7 @@ pub(crate) fn places_wgsl() -> String {
     [&constants, CAMERA_WGSL, FRAME_WGSL, BACKWARD_FRAME_WGSL, PLACES_WGSL].concat()
 }
 
-/// `carry_color`: the pixel's dL/d colour is what it carries to the Gaussians.
+/// Returns the WGSL of the blending's derivative. With `carry_color`, pixels carry their dL/d colour to the Gaussians.
 pub(crate) fn blend_wgsl(tile: Tile, with_depth: bool, carry_color: bool) -> String {
     let invocations = tile.0 * tile.0 / 4;
     let batch = PARTIAL_BYTES / (invocations * PAIR_SUM_BYTES as u32);

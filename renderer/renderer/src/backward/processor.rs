@@ -1,4 +1,4 @@
-//! Backward rasteriser: `backward/blend.wgsl` on the processor, and the sums by Gaussian.
+//! Backward rasteriser on the processor: `backward/blend.wgsl` and the sums per Gaussian.
 
 #![allow(clippy::needless_range_loop)] // one index for several lanes is what compilers turn into vectors
 
@@ -23,23 +23,23 @@ use crate::raster::processor::rasterizer::{ProcessorRasterizer, RasterImage};
 use crate::raster::processor::shape::Shape;
 
 const ROWS: usize = TILE as usize;
-/// Gaussians that one task carries to the world.
+/// Gaussians per task of the projection's derivative.
 const CHUNK: usize = 1024;
 
-/// [`BackwardRasterizer`](crate::BackwardRasterizer) on the processor. Its arrays are used again.
+/// [`BackwardRasterizer`](crate::BackwardRasterizer) on the processor. The next image reuses its arrays.
 #[derive(Debug, Default)]
 pub(crate) struct ProcessorBackward {
-    /// By position in the lists; of tiles that were blended.
+    /// Sum per list entry; valid for blended tiles.
     pair_sums: Vec<PairSum>,
-    /// Pairs walked of each tile.
+    /// Number of pairs walked per tile.
     walked: Vec<u32>,
-    /// By Gaussian.
+    /// Sum per Gaussian.
     sums: Vec<PairSum>,
     is_touched: Vec<bool>,
 }
 
 impl ProcessorBackward {
-    /// Adds the derivatives of the image that `rasterizer` drew last. Arrays have been checked.
+    /// Adds the derivatives of the image that `rasterizer` rendered last. The caller has checked the arrays.
     pub(crate) fn add(
         &mut self,
         rasterizer: &ProcessorRasterizer,
@@ -63,7 +63,7 @@ impl ProcessorBackward {
         }
     }
 
-    /// Sums over the pixels of the image for each Gaussian. `carries_color`: dL/d colour is what pixels carry.
+    /// Sums over the pixels of the image for each Gaussian. With `carries_color`, pixels carry their dL/d colour.
     fn sum(
         &mut self,
         rasterizer: &ProcessorRasterizer,
@@ -179,34 +179,34 @@ impl ProcessorBackward {
     }
 }
 
-/// The images of one view.
+/// Images and incoming derivatives of one view.
 struct Pixels<'a> {
     size: [usize; 2],
     color: &'a [[f32; 4]],
     depth: Option<&'a Vec<f32>>,
     d_color: &'a [[f32; 4]],
     d_depth: &'a [[f32; 4]],
-    /// dL/d colour is carried to the Gaussians in place of the last three of `d_depth`.
+    /// Whether dL/d colour is carried to the Gaussians in place of the last three numbers of `d_depth`.
     carries_color: bool,
 }
 
-/// Incoming derivatives of a tile's pixels. A pixel that cannot matter starts opaque.
+/// Incoming derivatives of a tile's pixels. A pixel without influence starts opaque.
 struct State {
     transmittance: TileLanes,
     color: [TileLanes; 3],
-    /// dL/d alpha of the pixel times the light that passes all.
+    /// dL/d alpha of the pixel times its final transmittance.
     passing: TileLanes,
-    /// dL/d depth / alpha, and the drawn depth.
+    /// dL/d depth / alpha; `mean_depth` is the rendered depth.
     by_depth: TileLanes,
     mean_depth: TileLanes,
     carried: [TileLanes; 3],
-    /// Loss by the colours that are still to be blended, were the loss linear. Depths are taken from the drawn depth: theirs
-    /// add up to 0.
+    /// Linearised loss of the colours that are still to be blended. Depths are relative to the rendered depth, so that
+    /// theirs sum to 0.
     behind: TileLanes,
 }
 
 impl Pixels<'_> {
-    /// Incoming derivatives of a tile; None where no pixel matters.
+    /// Returns the incoming derivatives of a tile; `None` where no pixel has any.
     fn state(&self, column: usize, row: usize) -> Option<State> {
         const ZERO: TileLanes = [[0.0; LANES]; ROWS];
         let mut state = State {
@@ -251,8 +251,8 @@ impl Pixels<'_> {
     }
 }
 
-/// Walks over a tile's list front to back again; what lies behind a splat is the finished pixel less what was blended so far.
-/// Writes the sum of each pair and returns how many pairs were walked.
+/// Derivative of a tile's blending. The list is walked front to back again; the light from behind a splat is the
+/// finished pixel less what was blended so far. Writes the sum of each pair and returns the number of pairs walked.
 struct TileBackward<'a> {
     state: State,
     origin: [f32; 2],
@@ -284,7 +284,7 @@ impl pulp::NullaryFnOnce for TileBackward<'_> {
 }
 
 impl State {
-    /// Adds a splat's part of a row to its sums.
+    /// Adds a splat's contribution in a row to its sums.
     #[inline(always)]
     fn add_row(
         &mut self,

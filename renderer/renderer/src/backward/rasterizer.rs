@@ -1,4 +1,4 @@
-//! Backward splat rasteriser: what a change of the Gaussians does to a loss on the images.
+//! Public interface of the backward splat rasteriser.
 
 use flyrig_gpu::{GpuContext, GpuError};
 use wgpu::CommandEncoder;
@@ -16,16 +16,16 @@ use crate::raster::rasterizer::RasterizerOn;
 /// Derivatives of [`Rasterizer`]'s images with respect to the centres of the Gaussians (FlyHuman section 3.1), and with respect
 /// to all attributes of [`AnisotropicBuffers`].
 ///
-/// - Complete where the image is smooth: place, depth, and the size and shape of the ellipse, through the lens and
-///   the low-pass filter. What jumps passes nothing on: a splat that enters or leaves a pixel at alpha 1/255, a pixel
-///   that is finished, the order by depth, back-face culling; at the clamp (alpha 0.99) alpha itself is constant. On
-///   the built-in body the jumps are 4 to 6 % of the loss's true slope (`--bench backward`).
-/// - No atomics: the sums of a tile go to a slot of their own and are added up row by row. Equal input gives equal
-///   bytes on one device.
-/// - A tile without a gradient costs the look at its pixels; a Gaussian without a pixel that matters costs nothing
-///   but a look at its tiles.
-/// - A Gaussian on more than 60,000 tiles, or behind the first 24,576 of a tile's list, gets nothing there. Sums that
-///   are not finite are left out.
+/// - Complete where the image is smooth: position, depth, and the size and shape of the ellipse, through the lens and
+///   the low-pass filter. Discontinuities contribute nothing: a splat that enters or leaves a pixel at alpha 1/255, a
+///   pixel that is finished, the order by depth, back-face culling; at the clamp (alpha 0.99) alpha itself is constant.
+///   On the built-in body the discontinuities are 4 to 6 % of the loss's true slope (`--bench backward`).
+/// - No atomics: the sums of a tile go to their own slots and are added row by row. Equal input gives equal bytes on
+///   one device.
+/// - A tile without a gradient costs one pass over its pixels; a Gaussian without influence costs one pass over its
+///   tiles.
+/// - A Gaussian on more than 60,000 tiles, or behind the first 24,576 of a tile's list, receives no derivative there.
+///   Non-finite sums are dropped.
 #[derive(Debug)]
 pub struct BackwardRasterizer {
     on: BackwardOn,
@@ -51,9 +51,9 @@ impl BackwardRasterizer {
         Ok(Self { on })
     }
 
-    /// Records the derivatives of the image that `rasterizer` recorded last, with the same `gaussians` and
-    /// `target`, and adds them to `out`. Views of one submission: encode a view, its loss, its derivative, the next
-    /// view. Without an image before, or with one without colour or of anisotropic Gaussians, nothing is recorded.
+    /// Records the derivatives of the image that `rasterizer` recorded last, with the same `gaussians` and `target`,
+    /// and adds them to `out`. Within one submission the order is: a view, its loss, its derivative, the next view.
+    /// Records nothing without a previous image, or for one without colour or of anisotropic Gaussians.
     ///
     /// # Errors
     /// [`BackwardError`]; nothing is recorded then.
@@ -72,8 +72,9 @@ impl BackwardRasterizer {
         self.add(gpu, encoder, rasterizer, target, incoming, to)
     }
 
-    /// As [`Self::encode`], of an image of anisotropic Gaussians; nothing is recorded for one of isotropic ones or of another
-    /// order. Pixels carry nothing but their dL/d colour: [`ImageGradients::depth_carry`] counts in x alone.
+    /// Records the derivatives of an image of anisotropic Gaussians, as [`Self::encode`] does of isotropic ones.
+    /// Records nothing for an image of isotropic Gaussians or of another order. Pixels carry only their dL/d colour: of
+    /// [`ImageGradients::depth_carry`] only x is used.
     ///
     /// # Errors
     /// [`BackwardError`]; nothing is recorded then.

@@ -7,7 +7,7 @@ use crate::backward::gradients::{Carry, GaussianGradients};
 use crate::buffers::GaussianBuffers;
 use crate::raster::settings::Latest;
 
-/// Gaussians that derivatives are carried to, and where these are added.
+/// Gaussians to which derivatives are carried, and the buffers that accumulate them.
 #[derive(Clone, Copy)]
 pub(crate) enum GradientTarget<'a> {
     Isotropic { gaussians: &'a GaussianBuffers, carry: Carry, out: &'a GaussianGradients },
@@ -15,7 +15,7 @@ pub(crate) enum GradientTarget<'a> {
 }
 
 impl GradientTarget<'_> {
-    /// Order of the colours; None for isotropic Gaussians.
+    /// Returns the harmonic order of the colours; `None` for isotropic Gaussians.
     pub(crate) fn order(&self) -> Option<HarmonicOrder> {
         match self {
             Self::Isotropic { .. } => None,

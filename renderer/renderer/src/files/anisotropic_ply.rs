@@ -1,8 +1,8 @@
 //! Anisotropic Gaussians as PLY files in the layout of the 3D Gaussian Splatting reference code.
 //!
-//! Those files hold harmonics of the sRGB colour, whose sum need not be the conversion of a linear sum. The constant part is
-//! converted exactly and the others by the slope of the conversion there, and back the same way: what is written and read again
-//! is the same, and what other tools wrote looks the same where the colour varies little with the direction.
+//! Those files hold harmonics of the sRGB colour, whose sum need not be the conversion of a linear sum. The constant
+//! part is converted exactly and the others by the slope of the conversion there, and inversely on reading: writing and
+//! reading preserves colours, and files of other tools look the same where the colour varies little with the direction.
 
 use std::path::Path;
 
@@ -13,7 +13,7 @@ use crate::files::ply::{SH_DEGREE_0, log_scale, opacity_logit, write_ply};
 use crate::schema::PLY_PROPERTIES;
 use crate::schema::anisotropic_ply_properties;
 
-/// Why bytes are no PLY file of Gaussians.
+/// Reason why bytes are no PLY file of Gaussians.
 #[derive(Debug, thiserror::Error, PartialEq, Eq)]
 pub enum PlyError {
     /// The header is not one of a file of Gaussians.
@@ -37,7 +37,7 @@ pub enum PlyError {
     },
 }
 
-/// Writes Gaussians as binary PLY. Normals are 0; Gaussians that hold a NaN or an infinity are left out. Returns how many were
+/// Writes Gaussians as binary PLY. Normals are 0; Gaussians with a NaN or an infinity are skipped. Returns the number
 /// written.
 ///
 /// # Errors
@@ -50,8 +50,8 @@ pub fn write_anisotropic_ply(path: &Path, splats: &AnisotropicSplats) -> Result<
     Ok(count)
 }
 
-/// Gaussians of a binary PLY file. Harmonics above order 2 and further properties are ignored; Gaussians that hold a NaN or an
-/// infinity are left out.
+/// Parses a binary PLY file. Harmonics above order 2 and further properties are ignored; Gaussians with a NaN or an
+/// infinity are skipped.
 ///
 /// # Errors
 /// [`PlyError`].
@@ -92,7 +92,7 @@ pub fn parse_anisotropic_ply(bytes: &[u8]) -> Result<AnisotropicSplats, PlyError
     Ok(splats)
 }
 
-/// Values of Gaussian `i` in the order of the properties.
+/// Returns the values of Gaussian `i` in the order of the properties.
 fn row(splats: &AnisotropicSplats, i: usize) -> Vec<f32> {
     let coefficients = splats.order.coefficients();
     let harmonics = &splats.harmonics[i * coefficients..(i + 1) * coefficients];
@@ -153,13 +153,13 @@ fn decode(srgb: f32) -> f32 {
 struct Header<'a> {
     gaussians: u64,
     properties: Vec<&'a str>,
-    /// Length with the last line.
+    /// Length including the last line, bytes.
     bytes: usize,
 }
 
 impl<'a> Header<'a> {
     fn parse(bytes: &'a [u8]) -> Result<Self, PlyError> {
-        /// Longer than any header of Gaussians.
+        /// Bound on the length of a header, bytes.
         const LONGEST: usize = 1 << 16;
         let mut header = Self { gaussians: 0, properties: Vec::new(), bytes: 0 };
         let mut section = Section::Magic;
@@ -191,14 +191,14 @@ impl<'a> Header<'a> {
     }
 }
 
-/// Part of a header that comes next.
+/// Expected next part of a header.
 #[derive(Clone, Copy, PartialEq, Eq)]
 enum Section {
     Magic,
     Format,
     Element,
     Vertex,
-    /// Elements after the Gaussians.
+    /// Section of elements after the Gaussians.
     Others,
 }
 

@@ -5,30 +5,30 @@ use std::path::{Path, PathBuf};
 
 use flyrig_types::write_whole;
 
-/// Why an export failed.
+/// Reason why an export failed.
 #[derive(Debug, thiserror::Error)]
 pub enum ExportError {
     /// The file could not be written.
     #[error("cannot write {}: {source}; check that the folder exists, may be written and has room", path.display())]
     Io {
-        /// Which file.
+        /// Path of the file.
         path: PathBuf,
-        /// The system's word.
+        /// Reason given by the system.
         source: io::Error,
     },
 }
 
-/// Y_0^0.
+/// Spherical harmonic of degree 0, Y_0^0.
 pub const SH_DEGREE_0: f32 = 0.282_094_8;
 
-/// Opacity in a PLY file; 1 would have an infinite logit.
+/// Returns the logit of an opacity for a PLY file; clamped, since 1 would have an infinite logit.
 pub(crate) fn opacity_logit(opacity: f32) -> f32 {
     const MARGIN: f32 = 1e-4;
     let opacity = opacity.clamp(MARGIN, 1.0 - MARGIN);
     (opacity / (1.0 - opacity)).ln()
 }
 
-/// Standard deviation in a PLY file.
+/// Returns the natural logarithm of a standard deviation for a PLY file.
 pub(crate) fn log_scale(scale_m: f32) -> f32 {
     const SMALLEST_M: f32 = 1e-9;
     scale_m.max(SMALLEST_M).ln()

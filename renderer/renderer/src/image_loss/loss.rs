@@ -1,4 +1,4 @@
-//! How a drawn image differs from the wanted one, and what the backward rasteriser needs to know of it.
+//! Comparison of rendered and wanted images, with the derivatives that the backward rasteriser takes.
 
 use bytemuck::bytes_of;
 use flyrig_gpu::{ComputeKernel, GpuContext, GpuError, StorageBuffer};
@@ -16,20 +16,20 @@ const WGSL: &str = include_str!("image_loss.wgsl");
 /// Sums of one image over its area.
 #[derive(Debug, Clone, Copy, PartialEq, Default)]
 pub struct ImageSums {
-    /// The loss.
+    /// Weighted loss.
     pub loss: f64,
     /// Squared difference of alpha, pixels.
     pub mask: f64,
-    /// Squared difference of colour, by how much of the person is wanted in a pixel.
+    /// Squared difference of colour, weighted by the wanted coverage.
     pub color: f64,
-    /// How much of the person is wanted, pixels.
+    /// Sum of the wanted coverage, pixels.
     pub wanted: f64,
 }
 
-/// An image that should be drawn.
+/// Target image of a comparison.
 #[derive(Debug)]
 pub struct WantedImage {
-    /// Pixels of the bytes, and how many of them make the side of a pixel.
+    /// Size of the source in pixels; `shrink` is the number of source pixels along the side of a compared pixel.
     source: [u32; 2],
     shrink: u32,
     width: u32,
@@ -40,11 +40,11 @@ pub struct WantedImage {
 }
 
 impl WantedImage {
-    /// The smallest is an 8th as wide and high.
+    /// Largest level: an eighth of the width and height.
     pub const MAX_LEVEL: u32 = 3;
 
-    /// For images of `source` pixels, compared at `1 / 2^level` of that in each direction (rounded down, at least a
-    /// pixel): colours are means, in linear light and by coverage.
+    /// Allocates a target for images of `source` pixels, compared at `1 / 2^level` of that in each direction (rounded
+    /// down, at least a pixel): colours are coverage-weighted means in linear light.
     ///
     /// # Errors
     /// [`GpuError::TooLarge`].
@@ -64,7 +64,7 @@ impl WantedImage {
         })
     }
 
-    /// Pixels of the image as it is compared, width and height.
+    /// Returns width and height of the compared image, pixels.
     #[must_use]
     pub fn size(&self) -> [u32; 2] {
         [self.width, self.height]
@@ -78,10 +78,10 @@ struct LossKernels {
     add_up: ComputeKernel,
 }
 
-/// Compares images where they lie. Sums are made in a fixed order: equal input gives equal bytes on one device.
+/// Comparison of images on the device. Sums run in a fixed order: equal input gives equal bytes on one device.
 #[derive(Debug)]
 pub struct ImageLoss {
-    /// None on the processor.
+    /// `None` on the processor.
     kernels: Option<LossKernels>,
     linear: StorageBuffer<f32>,
     sums: StorageBuffer<[f32; 4]>,
@@ -106,7 +106,7 @@ impl ImageLoss {
         })
     }
 
-    /// Room for the sums of `pictures` images.
+    /// Grows the buffer of sums to `pictures` images.
     ///
     /// # Errors
     /// [`GpuError::TooLarge`].
@@ -118,8 +118,9 @@ impl ImageLoss {
         Ok(())
     }
 
-    /// Records the conversion of `image` (sRGB bytes with coverage, a pixel an element, row by row) to linear light at the
-    /// compared size, within `settings.area`. Once an image and area. An image of too few pixels is not converted.
+    /// Records the conversion of `image` (sRGB bytes with coverage, one element per pixel, row by row) to linear light
+    /// at the compared size, within `settings.area`. Needed once per image and area. An image with too few pixels is
+    /// ignored.
     pub fn prepare(
         &self,
         gpu: &GpuContext,
@@ -145,8 +146,8 @@ impl ImageLoss {
         run(gpu, &mut pass, unpack, &resources, groups);
     }
 
-    /// Records the comparison of a drawn image as number `index`, and writes its derivatives to `out`, both within
-    /// `settings.area`. Images smaller than the wanted one are not compared.
+    /// Records the comparison of a rendered image as number `index`, and writes its derivatives to `out`, both within
+    /// `settings.area`. Images of another size than the wanted one are not compared.
     #[allow(clippy::too_many_arguments)]
     pub fn encode(
         &self,
@@ -206,7 +207,7 @@ impl ImageLoss {
     }
 }
 
-/// Constants of a comparison and its workgroups; None where there is no area.
+/// Returns the constants of a comparison and its workgroups; `None` for an empty area.
 fn constants(wanted: &WantedImage, index: u32, settings: &LossSettings) -> Option<(LossConstants, (u32, u32))> {
     let [left, top, right, bottom] = settings.area;
     let (right, bottom) = (right.min(wanted.width), bottom.min(wanted.height));

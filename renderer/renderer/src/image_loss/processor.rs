@@ -1,4 +1,4 @@
-//! `image_loss.wgsl` on the processor. Threads share rows; sums are made a row at a time, in the rows' order.
+//! `image_loss.wgsl` on the processor. Threads share rows; sums run per row, in the order of the rows.
 
 use std::array::from_fn;
 
@@ -9,7 +9,8 @@ use rayon::prelude::*;
 use crate::backward::gradients::ImageGradients;
 use crate::image_loss::settings::{LossConstants, SUMS, UNKNOWN_RGBA};
 
-/// Converts sRGB bytes with coverage to premultiplied linear colour at the compared size; negative where nothing is known.
+/// Converts sRGB bytes with coverage to premultiplied linear colour at the compared size; negative where the image is
+/// unknown.
 pub(super) fn unpack(
     loss: &LossConstants,
     bytes: &StorageBuffer<u32>,
@@ -41,7 +42,7 @@ pub(super) fn unpack(
     });
 }
 
-/// Compares a drawn image with the wanted one.
+/// Compares a rendered image with the wanted one.
 pub(super) fn compare(
     loss: &LossConstants,
     wanted: &StorageBuffer<[f32; 4]>,
@@ -94,7 +95,7 @@ pub(super) fn compare(
     }
 }
 
-/// The rows of the area within an image: number of the row, and its part in the area.
+/// Returns the rows of the area within an image: row number, and the part of the row in the area.
 fn rows<'a>(
     loss: &LossConstants,
     picture: &'a mut [[f32; 4]],

@@ -2,11 +2,11 @@
 
 use bytemuck::{Pod, Zeroable};
 
-/// Pixels of a column that one invocation compares.
+/// Pixels of a column per invocation.
 pub(super) const ROWS: u32 = 4;
-/// Columns that a workgroup compares.
+/// Columns per workgroup.
 pub(super) const LANES: u32 = 64;
-/// Sums an image that are read back; the CPU adds them up in `f64`.
+/// Partial sums per image that are read back; the CPU adds them in `f64`.
 pub(super) const SUMS: u32 = 64;
 
 /// Weights of an image's loss
@@ -18,15 +18,15 @@ pub struct LossSettings {
     pub color_weight: f32,
     /// λ_mask.
     pub mask_weight: f32,
-    /// What counts, `[left, top, right, bottom]` in pixels, right and bottom excluded.
+    /// Compared area, `[left, top, right, bottom]` in pixels, right and bottom excluded.
     pub area: [u32; 4],
-    /// Whether pixels of the image that are [`UNKNOWN_RGBA`] say nothing: a compared pixel with more than half of them
-    /// counts neither in the loss nor in its derivatives.
+    /// Whether pixels of the image that are [`UNKNOWN_RGBA`] are ignored: a compared pixel with more than half of them
+    /// adds neither to the loss nor to its derivatives.
     pub with_unknown: bool,
 }
 
-/// Marks a pixel that says nothing about the person: no coverage, and a colour next to black. Other people's pixels, for
-/// example.
+/// Marker of a pixel without information about the person, such as another person's: no coverage, and a colour next to
+/// black.
 pub const UNKNOWN_RGBA: [u8; 4] = [0, 0, 1, 0];
 
 /// Constants of one comparison, `struct Loss` in image_loss.wgsl.

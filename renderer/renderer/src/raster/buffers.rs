@@ -5,15 +5,15 @@ use flyrig_gpu::{GpuContext, GpuError, MAX_WORKGROUPS_PER_DIMENSION, StorageBuff
 use crate::raster::kernels::{BINS_LANES, Tile};
 use crate::sort::radix::{Keys, RadixSort};
 
-/// Room for pairs of a Gaussian and a tile. A body-like surface needs about three a Gaussian; the share
-/// of the tiles is for a few Gaussians that cover the whole image.
+/// Capacity for (tile, Gaussian) pairs per Gaussian. A body-like surface needs about three; the capacity per tile
+/// serves a few Gaussians that cover the whole image.
 pub(crate) const PAIRS_PER_GAUSSIAN: u64 = 16;
 pub(crate) const PAIRS_PER_TILE: u64 = 64;
 pub(crate) const MIN_PAIRS: u64 = 1 << 18;
-/// Most pairs that one dispatch of the kernel that writes them can reach.
+/// Largest number of pairs that one dispatch of the kernel that writes them can reach.
 const MOST_PAIRS: u64 = MAX_WORKGROUPS_PER_DIMENSION as u64 * BINS_LANES as u64;
 
-/// Pairs that an image has room for, at most `limit`.
+/// Returns the number of pairs that an image has room for, at most `limit`.
 pub(crate) fn pair_capacity(gaussians: usize, tiles: u64, limit: u64) -> u32 {
     let wanted = PAIRS_PER_GAUSSIAN * gaussians as u64 + PAIRS_PER_TILE * tiles;
     wanted.max(MIN_PAIRS).min(limit).min(u64::from(u32::MAX)) as u32
@@ -24,9 +24,9 @@ pub(crate) struct ImageBuffers {
     layout: Layout,
     size: [u32; 2],
     gaussians: usize,
-    /// End of each tile's list.
+    /// End of each tile's list, elements of [`Self::lists`].
     pub ends: StorageBuffer<u32>,
-    /// Sorts (tile, Gaussian) by tile.
+    /// Sort of (tile, Gaussian) by tile.
     pub sort: RadixSort,
 }
 
@@ -51,7 +51,7 @@ impl ImageBuffers {
         })
     }
 
-    /// Ready for images of `size`; allocates only when the room does not suffice.
+    /// Prepares for images of `size`; reallocates only where the capacity does not suffice.
     pub(crate) fn fit(
         &mut self,
         gpu: &GpuContext,
@@ -75,7 +75,7 @@ impl ImageBuffers {
         self.layout
     }
 
-    /// The lists, one after the other: (tile, Gaussian).
+    /// Returns the concatenated lists, elements (tile, Gaussian).
     pub(crate) fn lists(&self) -> &StorageBuffer<[u32; 2]> {
         self.sort.output(self.layout.keys())
     }
@@ -96,7 +96,7 @@ impl Layout {
         self.tiles[0].saturating_mul(self.tiles[1]).max(1)
     }
 
-    /// Of the sort by tile.
+    /// Returns the key range of the sort by tile.
     pub(crate) fn keys(self) -> Keys {
         Keys::Below(self.tile_count())
     }

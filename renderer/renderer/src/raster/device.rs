@@ -1,5 +1,5 @@
-//! The forward rasteriser on the device: projection through the camera's lens (EWA splatting), stable sort by depth, lists by
-//! tile, and front-to-back blending, without a wait.
+//! Forward rasteriser on the device: projection through the camera's lens (EWA splatting), stable sort by depth, lists
+//! by tile, and front-to-back blending, without waiting for the device.
 
 use std::sync::Arc;
 
@@ -18,8 +18,8 @@ use crate::raster::settings::{Outputs, RasterSettings, RasterStats};
 use crate::sort::radix::{DIGIT_BITS, KEY_BITS, Keys, MOST_ELEMENTS, RadixSort, SortPass, blocks, table_len};
 use crate::sort::scan::{Scan, Workgroups, run, run_at};
 
-/// [`Rasterizer`](crate::Rasterizer) on the device. Buffers and pipelines are made once; they grow with the image and the
-/// number of Gaussians.
+/// [`Rasterizer`](crate::Rasterizer) on the device. Buffers and pipelines are created once and grow with the image and
+/// the number of Gaussians.
 #[derive(Debug)]
 pub(crate) struct DeviceRasterizer {
     pub(crate) kernels: RasterKernels,
@@ -27,14 +27,14 @@ pub(crate) struct DeviceRasterizer {
     pub(crate) sort: RadixSort,
     pub(crate) splats: StorageBuffer<[f32; 8]>,
     pub(crate) rects: StorageBuffer<[u32; 2]>,
-    /// Colours of anisotropic Gaussians as the camera sees them; grows with the first image of such.
+    /// Colours of anisotropic Gaussians as seen from the camera; allocated with the first image of such Gaussians.
     pub(crate) painted: StorageBuffer<[f32; 4]>,
     pub(crate) pairs_before: StorageBuffer<u32>,
     pair_total: StorageBuffer<u32>,
     /// `struct Work` of bins.wgsl.
     work: StorageBuffer<u32>,
     stats: StorageBuffer<u32>,
-    /// Of the image recorded last.
+    /// Constants of the image recorded last.
     pub(crate) constants: Constants,
     pub(crate) picture: Option<ImageBuffers>,
     pub(crate) latest: Option<Latest>,
@@ -157,7 +157,7 @@ impl DeviceRasterizer {
     }
 }
 
-/// Refuses more Gaussians than can be sorted.
+/// Rejects more Gaussians than can be sorted.
 fn check_count(count: usize) -> Result<(), GpuError> {
     let bytes = |count: usize| count as u64 * size_of::<[u32; 2]>() as u64;
     if count > MOST_ELEMENTS {
@@ -167,7 +167,7 @@ fn check_count(count: usize) -> Result<(), GpuError> {
     Ok(())
 }
 
-/// Places in the [`Constants`] of one encoding: the frame, lengths of what is scanned, passes of the sorts.
+/// Indices into the [`Constants`] of one encoding: the frame, lengths of the scanned arrays, passes of the sorts.
 pub(crate) const FRAME: usize = 0;
 const RANKS: usize = 1;
 const DEPTH_TABLE: usize = 2;
@@ -175,7 +175,7 @@ const DEPTH_PASSES: usize = 3;
 const TILE_PASSES: usize = DEPTH_PASSES + KEY_BITS.div_ceil(DIGIT_BITS) as usize;
 const MOST_TILE_PASSES: usize = u32::BITS.div_ceil(DIGIT_BITS) as usize;
 
-/// Everything that one image's kernels are bound to.
+/// Resources that the kernels of one image are bound to.
 struct Stages<'a> {
     gpu: &'a GpuContext,
     rasterizer: &'a DeviceRasterizer,
@@ -278,7 +278,7 @@ impl Stages<'_> {
     }
 }
 
-/// The resources that a kernel uses, with the numbers of their bindings.
+/// Selects the resources that a kernel uses, with their binding numbers.
 fn numbered<'a>(resources: &[BindingResource<'a>], used: &[u32]) -> Vec<(u32, BindingResource<'a>)> {
     used.iter().filter_map(|&binding| Some((binding, resources.get(binding as usize)?.clone()))).collect()
 }

@@ -1,4 +1,4 @@
-//! Compiled kernels of the rasteriser and the numbers they are compiled with.
+//! Compiled kernels of the rasteriser and their compile-time constants.
 
 use std::collections::HashMap;
 use std::sync::{Arc, Mutex, OnceLock, PoisonError};
@@ -30,9 +30,9 @@ pub(crate) const MAX_ALPHA: f64 = 0.99;
 /// Transmittance below which a pixel is finished.
 pub(crate) const OPAQUE: f64 = 1e-4;
 
-/// A Gaussian is back-facing when the cosine between its normal and the line of sight is above this. Not 0: a
-/// Gaussian just behind the rim reaches out beyond it. On the built-in body with a dense front the mean error
-/// falls from 0.015 at 0 to 0.002 at 0.35, for a quarter more Gaussians (tests/raster_culling.rs).
+/// Cosine between normal and line of sight above which a Gaussian is back-facing. Not 0: a Gaussian just behind the
+/// silhouette reaches out beyond it. On the built-in body with a dense front the mean error falls from 0.015 at 0 to
+/// 0.002 at 0.35, for a quarter more Gaussians (tests/raster_culling.rs).
 pub const BACKFACING_COSINE: f64 = 0.35;
 
 /// Side of a tile, pixels; a multiple of the four rows that one invocation blends.
@@ -40,9 +40,9 @@ pub const BACKFACING_COSINE: f64 = 0.35;
 pub(crate) struct Tile(pub u32);
 
 impl Tile {
-    /// A tile of a CPU in disguise need not fill more than its vector lanes.
+    /// Tile of a software adapter, which need not fill more than its vector lanes.
     pub(crate) const SOFTWARE: Self = Self(8);
-    /// Of a GPU.
+    /// Tile of a GPU.
     pub(crate) const HARDWARE: Self = Self(16);
 
     pub(crate) fn for_adapter(gpu: &GpuContext) -> Self {
@@ -86,14 +86,14 @@ pub(crate) fn project_anisotropic_wgsl(tile: Tile) -> String {
     [&tile.wgsl(), CAMERA_WGSL, FRAME_WGSL, &attributes, AXES_WGSL, &of_kind(PROJECT_WGSL, true)].concat()
 }
 
-/// The kernel that colours anisotropic Gaussians.
+/// Returns the WGSL that colours anisotropic Gaussians.
 pub(crate) fn paint_wgsl(order: HarmonicOrder) -> String {
     let constants = format!("const INVALID_KEY: u32 = {INVALID_KEY}u;\n");
     let attributes = bindings_wgsl(1, &[CENTER, HARMONICS]);
     [&constants, CAMERA_WGSL, FRAME_WGSL, &attributes, &harmonics_wgsl(order), PAINT_WGSL].concat()
 }
 
-/// Colour by direction and its derivatives.
+/// Returns the WGSL of colours by direction and their derivatives.
 pub(crate) fn harmonics_wgsl(order: HarmonicOrder) -> String {
     let coefficients = order.coefficients();
     [&format!("const COEFFICIENTS: u32 = {coefficients}u;\n"), HARMONICS_WGSL].concat()
@@ -106,7 +106,7 @@ pub(crate) fn bins_wgsl() -> String {
     [&constants, CAMERA_WGSL, FRAME_WGSL, BINS_WGSL].concat()
 }
 
-/// The kernel that writes these outputs; at most two of them fit the bindings of one.
+/// Returns the WGSL that blends these outputs; at most two of them fit the bindings of one kernel.
 pub(crate) fn blend_wgsl(tile: Tile, outputs: Outputs) -> String {
     let Outputs { color, depth, canonical } = outputs;
     let of_outputs = sections(BLEND_WGSL, |name| match name {
@@ -117,7 +117,7 @@ pub(crate) fn blend_wgsl(tile: Tile, outputs: Outputs) -> String {
     [&tile.wgsl(), CAMERA_WGSL, FRAME_WGSL, BUSY_WGSL, &of_outputs].concat()
 }
 
-/// WGSL without the lines between `// only NAME` and `// end` where `keeps` refuses the name.
+/// Returns the WGSL without the lines between `// only NAME` and `// end` whose name `keeps` rejects.
 fn sections(source: &str, keeps: impl Fn(&str) -> bool) -> String {
     let mut kept = String::new();
     let mut keep = true;
@@ -132,12 +132,12 @@ fn sections(source: &str, keeps: impl Fn(&str) -> bool) -> String {
     kept
 }
 
-/// WGSL of one kind of Gaussians.
+/// Returns the sections for one kind of Gaussians.
 pub(crate) fn of_kind(source: &str, is_anisotropic: bool) -> String {
     sections(source, |name| (name == "anisotropic") == is_anisotropic)
 }
 
-/// The outputs of each kernel that draws `outputs`, so that none binds more than 8 buffers.
+/// Splits `outputs` over kernels that bind at most 8 buffers each; returns their outputs and their number.
 pub(crate) fn blend_passes(outputs: Outputs) -> ([Outputs; 2], usize) {
     let surface = Outputs { depth: false, ..outputs };
     let depth = Outputs { color: false, canonical: false, ..outputs };
@@ -154,7 +154,7 @@ pub(crate) struct RasterKernels {
     pub end_lists: ComputeKernel,
     blend: Mutex<HashMap<Outputs, Arc<ComputeKernel>>>,
     project_anisotropic: OnceLock<ComputeKernel>,
-    /// By order.
+    /// One kernel per harmonic order.
     paint: [OnceLock<ComputeKernel>; 3],
 }
 
@@ -180,7 +180,7 @@ impl RasterKernels {
         kernels
     }
 
-    /// The blending kernels that write these outputs, and what each of them writes; compiled on first use.
+    /// Returns the blending kernels for these outputs with the outputs of each; compiles them on first use.
     pub(crate) fn blend(&self, gpu: &GpuContext, outputs: Outputs) -> Vec<(Outputs, Arc<ComputeKernel>)> {
         let (passes, count) = blend_passes(outputs);
         let mut kernels = self.blend.lock().unwrap_or_else(PoisonError::into_inner);
@@ -190,13 +190,13 @@ impl RasterKernels {
         passes[..count].iter().map(kernel).collect()
     }
 
-    /// The kernel that projects anisotropic Gaussians; compiled on first use.
+    /// Returns the kernel that projects anisotropic Gaussians; compiles it on first use.
     pub(crate) fn project_anisotropic(&self, gpu: &GpuContext) -> &ComputeKernel {
         let compile = || ComputeKernel::new(gpu, "project", &[&project_anisotropic_wgsl(self.tile)], "project");
         self.project_anisotropic.get_or_init(compile)
     }
 
-    /// The kernel that colours anisotropic Gaussians; compiled on first use.
+    /// Returns the kernel that colours anisotropic Gaussians; compiles it on first use.
     pub(crate) fn paint(&self, gpu: &GpuContext, order: HarmonicOrder) -> &ComputeKernel {
         self.paint[order as usize].get_or_init(|| ComputeKernel::new(gpu, "paint", &[&paint_wgsl(order)], "paint"))
     }

@@ -1,4 +1,4 @@
-//! Forward splat rasteriser: what it draws and how it is called.
+//! Public interface of the forward splat rasteriser.
 
 use std::time::Duration;
 
@@ -17,20 +17,20 @@ use crate::raster::settings::{RasterSettings, RasterStats};
 /// sort by depth, lists by tile, and front-to-back blending, all on the device without a wait, or on the processor when the
 /// image is recorded.
 ///
-/// - Depth order is that of the centres, to 24 bits of the range of their depths as floats; equal depths keep the
-///   order of the buffers. Equal input gives equal bytes on one device.
-/// - `alpha = min(opacity * exp(-r²/2), 0.99)`; below 1/255 a splat does not touch a pixel; a pixel is
-///   finished when less than 1e-4 of the light behind it would pass.
-/// - A Gaussian with any number that is not finite, with scale or opacity not above 0, behind
-///   [`RasterSettings::near_m`], beyond 1e9 m, or outside the lens's valid radius is not drawn.
-/// - [`AnisotropicBuffers`](crate::AnisotropicBuffers) go the same way once they are projected and coloured.
-/// - Buffers and pipelines are made once; they grow with the image and the number of Gaussians.
+/// - Gaussians are ordered by the depth of their centres, to 24 bits of the range of the depths as floats; equal depths
+///   keep the order of the buffers. Equal input gives equal bytes on one device.
+/// - `alpha = min(opacity * exp(-r²/2), 0.99)`; below 1/255 a splat does not touch a pixel; a pixel is finished once
+///   its transmittance is below 1e-4.
+/// - A Gaussian with a non-finite number, with scale or opacity not above 0, behind [`RasterSettings::near_m`], beyond
+///   1e9 m, or outside the lens's valid radius is not drawn.
+/// - [`AnisotropicBuffers`](crate::AnisotropicBuffers) share all steps after projection and colouring.
+/// - Buffers and pipelines are created once and grow with the image and the number of Gaussians.
 #[derive(Debug)]
 pub struct Rasterizer {
     pub(crate) on: RasterizerOn,
 }
 
-/// Where the kernels run.
+/// Implementation by the place where kernels run.
 #[derive(Debug)]
 pub(crate) enum RasterizerOn {
     Device(Box<DeviceRasterizer>),
@@ -38,7 +38,7 @@ pub(crate) enum RasterizerOn {
 }
 
 impl Rasterizer {
-    /// Room for `max_gaussians`.
+    /// Creates a rasteriser with buffers for `max_gaussians`.
     ///
     /// # Errors
     /// [`GpuError::TooLarge`].
@@ -51,11 +51,11 @@ impl Rasterizer {
         Ok(Self { on })
     }
 
-    /// Records the rendering of one image. Its size is the target's; the camera's own width and height
-    /// do not matter. Any number of images can go into one encoder.
+    /// Records the rendering of one image. The target determines its size; the camera's own width and height are
+    /// ignored. One encoder takes any number of images.
     ///
     /// # Errors
-    /// [`GpuError::TooLarge`] when buffers must grow and cannot.
+    /// [`GpuError::TooLarge`] where buffers would have to grow beyond the adapter's limits.
     pub fn encode<'a>(
         &mut self,
         gpu: &GpuContext,
@@ -68,7 +68,8 @@ impl Rasterizer {
         self.encode_timed(gpu, encoder, gaussians, (camera, settings), target, None)
     }
 
-    /// [`Self::encode`] with the times of its four stages on the device: "project", "depth sort", "tile lists", "blend".
+    /// Records the image as [`Self::encode`] does and measures its four stages on the device: "project", "depth sort",
+    /// "tile lists", "blend".
     ///
     /// # Errors
     /// As [`Self::encode`].
@@ -94,7 +95,7 @@ impl Rasterizer {
         }
     }
 
-    /// The image that was recorded last; None before the first image.
+    /// Returns the description of the image recorded last; `None` before the first one.
     pub(crate) fn latest(&self) -> Option<Latest> {
         match &self.on {
             RasterizerOn::Device(device) => device.latest,
@@ -102,8 +103,8 @@ impl Rasterizer {
         }
     }
 
-    /// Run times of projection, depth sort, tile lists and blending of the latest image on the processor. None for the
-    /// device: pass a timer to [`Self::encode_timed`] there.
+    /// Returns the run times of projection, depth sort, tile lists and blending of the latest image on the processor.
+    /// `None` on a device: pass a timer to [`Self::encode_timed`] there.
     #[must_use]
     pub fn processor_times(&self) -> Option<[Duration; 4]> {
         match &self.on {
@@ -112,7 +113,7 @@ impl Rasterizer {
         }
     }
 
-    /// Waits for the device and returns what the latest image needed.
+    /// Waits for the device and returns the resources that the latest image used.
     ///
     /// # Errors
     /// [`GpuError::Lost`].

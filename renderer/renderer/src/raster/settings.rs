@@ -1,21 +1,21 @@
-//! Settings of a rendering, and figures of the latest one.
+//! Settings of a rendering and statistics of the latest one.
 
 use crate::anisotropic::buffers::Gaussians;
 use crate::anisotropic::order::HarmonicOrder;
 
-/// Which images of a [`crate::RenderTarget`] are written; the others keep their content.
+/// Selection of the images of a [`crate::RenderTarget`] that are written; the others keep their content.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
 pub struct Outputs {
-    /// [`crate::RenderTarget::color`].
+    /// Whether [`crate::RenderTarget::color`] is written.
     pub color: bool,
-    /// [`crate::RenderTarget::depth`].
+    /// Whether [`crate::RenderTarget::depth`] is written.
     pub depth: bool,
-    /// [`crate::RenderTarget::canonical`].
+    /// Whether [`crate::RenderTarget::canonical`] is written.
     pub canonical: bool,
 }
 
 impl Outputs {
-    /// Every image.
+    /// All images.
     pub const ALL: Self = Self { color: true, depth: true, canonical: true };
     /// Colour and alpha only.
     pub const COLOR: Self = Self { color: true, depth: false, canonical: false };
@@ -26,18 +26,19 @@ impl Outputs {
 /// Settings of a rendering.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct RasterSettings {
-    /// Gaussians whose centre is closer to the camera's plane are skipped, metres.
+    /// Distance from the camera's plane below which centres are skipped, metres.
     pub near_m: f32,
-    /// Skip Gaussians whose normal points away from the camera ([`crate::BACKFACING_COSINE`]). For closed surfaces.
+    /// Whether Gaussians whose normal points away from the camera are skipped ([`crate::BACKFACING_COSINE`]). For
+    /// closed surfaces.
     pub cull_backfacing: bool,
     /// Images to write.
     pub outputs: Outputs,
-    /// Variance of the low-pass filter that is added to every splat on the screen, square pixels.
-    /// The splat's opacity falls so that its integral stays: Mip-Splatting's 2D Mip filter (Yu et al.
-    /// 2024, Eq. 10). 0.1 is that paper's value for one pixel.
+    /// Variance of the low-pass filter that is added to every splat on the screen, square pixels. The splat's opacity
+    /// decreases so that its integral is preserved: Mip-Splatting's 2D Mip filter (Yu et al. 2024, Eq. 10). 0.1 is that
+    /// paper's value for one pixel.
     pub filter_variance_px2: f32,
-    /// Only the tiles that this part of the image touches are blended, `[left, top, right, bottom]` in pixels, right
-    /// and bottom excluded; all others keep their content. None: the whole image.
+    /// Part of the image whose tiles are blended, `[left, top, right, bottom]` in pixels, right and bottom excluded;
+    /// all other tiles keep their content. `None`: the whole image.
     pub area: Option<[u32; 4]>,
 }
 
@@ -48,7 +49,7 @@ impl Default for RasterSettings {
 }
 
 impl RasterSettings {
-    /// The settings as far as they apply to these Gaussians.
+    /// Returns the settings that apply to this kind of Gaussians.
     pub(crate) fn for_kind(&self, gaussians: Gaussians<'_>) -> Self {
         match gaussians {
             Gaussians::Isotropic(_) => *self,
@@ -65,10 +66,9 @@ impl RasterSettings {
 pub struct RasterStats {
     /// Gaussians that touch the image.
     pub visible_gaussians: u32,
-    /// Pairs of a Gaussian and a tile, at most one more than there is room for.
+    /// Pairs of a Gaussian and a tile, at most one more than the capacity.
     pub pairs: u32,
-    /// Images since this rasteriser was made that wanted more pairs than there was room for: they
-    /// lack their farthest Gaussians.
+    /// Images so far that exceeded the capacity for pairs and lack their farthest Gaussians.
     pub overflowed_images: u32,
 }
 
@@ -76,7 +76,7 @@ pub struct RasterStats {
 #[derive(Debug, Clone, Copy)]
 pub(crate) struct Latest {
     pub gaussians: usize,
-    /// Order of the colours; None for isotropic Gaussians.
+    /// Harmonic order of the colours; `None` for isotropic Gaussians.
     pub order: Option<HarmonicOrder>,
     pub size: [u32; 2],
     /// Columns and rows of tiles that were blended.
@@ -84,7 +84,7 @@ pub(crate) struct Latest {
     pub outputs: Outputs,
 }
 
-/// First tile, and columns and rows of the tiles that an area of pixels touches.
+/// Returns the first tile, and columns and rows of the tiles that an area of pixels touches.
 pub(crate) fn tile_range(area: Option<[u32; 4]>, tiles: [u32; 2], tile: u32) -> ([u32; 2], [u32; 2]) {
     let Some([left, top, right, bottom]) = area else { return ([0; 2], tiles) };
     let range = |first: u32, end: u32, count: u32| {

@@ -9,27 +9,28 @@ use crate::sort::scan::{Scan, Workgroups, run};
 const SORT_WGSL: &str = include_str!("radix.wgsl");
 /// Elements with this key are left out of the result.
 pub(crate) const INVALID_KEY: u32 = u32::MAX;
-/// Bits a pass.
+/// Bits per pass.
 pub(crate) const DIGIT_BITS: u32 = 8;
-/// Bits of their range to which scaled keys are compared.
+/// Bits of the key range to which scaled keys are compared.
 pub(crate) const KEY_BITS: u32 = 24;
-/// Elements of a workgroup.
+/// Elements per workgroup.
 pub(crate) const BLOCK: usize = 1024;
-/// Elements that can be sorted: a dispatch has no more workgroups.
+/// Largest number of elements, bounded by the workgroups of a dispatch.
 pub(crate) const MOST_ELEMENTS: usize = flyrig_gpu::MAX_WORKGROUPS_PER_DIMENSION as usize * BLOCK;
 
-/// How keys are compared.
+/// Interpretation of the keys.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(crate) enum Keys {
-    /// By `(key - smallest) >> shift`, the shift being the least that fits the range of the keys into [`KEY_BITS`]: exact
-    /// for ranges up to `2^KEY_BITS`, else keys closer than `2^shift` may count as equal. Elements with [`INVALID_KEY`] are left out.
+    /// Comparison of `(key - smallest) >> shift`, with the smallest shift that fits the range of the keys into
+    /// [`KEY_BITS`]: exact for ranges up to `2^KEY_BITS`, else keys closer than `2^shift` may compare equal. Elements
+    /// with [`INVALID_KEY`] are dropped.
     Scaled,
-    /// All below this number, as they are. How many elements there are says [`RadixSort::valid`] beforehand.
+    /// Keys below this number, compared exactly. [`RadixSort::valid`] holds the number of elements beforehand.
     Below(u32),
 }
 
 impl Keys {
-    /// Passes that a sort of these takes.
+    /// Returns the number of passes of a sort of such keys.
     pub(crate) fn passes(self) -> u32 {
         match self {
             Self::Scaled => KEY_BITS.div_ceil(DIGIT_BITS),
@@ -49,24 +50,24 @@ pub(crate) struct SortPass {
 }
 
 impl SortPass {
-    /// Of a sort of at most `count` elements.
+    /// Returns the constants of pass `index` of a sort of at most `count` elements.
     pub(crate) fn new(count: usize, keys: Keys, index: u32) -> Self {
         Self { count: count as u32, index, scaled: (keys == Keys::Scaled).into(), unused: 0 }
     }
 }
 
-/// Workgroups that sort so many elements.
+/// Returns the number of workgroups that sort this many elements.
 pub(crate) fn blocks(count: usize) -> u32 {
     count.div_ceil(BLOCK).max(1) as u32
 }
 
-/// Elements of the table for a sort of at most so many elements.
+/// Returns the number of table entries for a sort of at most this many elements.
 pub(crate) fn table_len(count: usize) -> u32 {
     blocks(count) << DIGIT_BITS
 }
 
-/// Stable least-significant-digit radix sort of `(key, payload)`, smallest key first. Equal input gives
-/// equal bytes: no assumption about when other workgroups make progress.
+/// Stable least-significant-digit radix sort of `(key, payload)`, smallest key first. Equal input gives equal bytes; no
+/// assumption is made about the progress of other workgroups.
 #[derive(Debug)]
 pub(crate) struct RadixSort {
     find_range: ComputeKernel,
@@ -96,7 +97,7 @@ impl RadixSort {
         })
     }
 
-    /// Room for `capacity` elements from now on.
+    /// Grows to a capacity of `capacity` elements.
     pub(crate) fn grow(&mut self, gpu: &GpuContext, capacity: usize) -> Result<(), GpuError> {
         if capacity > self.elements.len() {
             *self = Self::new(gpu, capacity)?;
@@ -104,33 +105,33 @@ impl RadixSort {
         Ok(())
     }
 
-    /// Elements there is room for.
+    /// Returns the capacity in elements.
     pub(crate) fn capacity(&self) -> usize {
         self.elements.len()
     }
 
-    /// Where the elements must be before [`Self::encode`].
+    /// Returns the buffer that holds the elements before [`Self::encode`].
     pub(crate) fn input(&self) -> &StorageBuffer<[u32; 2]> {
         &self.elements
     }
 
-    /// Where they are after it; only the first [`Self::valid`] mean anything.
+    /// Returns the buffer that holds them afterwards; only the first [`Self::valid`] are defined.
     pub(crate) fn output(&self, keys: Keys) -> &StorageBuffer<[u32; 2]> {
         if keys.passes().is_multiple_of(2) { &self.elements } else { &self.other }
     }
 
-    /// Number of elements that are sorted.
+    /// Returns the buffer with the number of sorted elements.
     pub(crate) fn valid(&self) -> &StorageBuffer<u32> {
         &self.valid
     }
 
-    /// Records what a sort needs before its pass.
+    /// Records the commands that a sort needs before its compute pass.
     pub(crate) fn prepare(&self, encoder: &mut CommandEncoder) {
         self.extremes.encode_clear(encoder);
     }
 
-    /// Sorts. `groups` are at least the [`blocks`] of what is sorted, `passes` the constants of each [`SortPass`], `scan_length`
-    /// the [`table_len`] of the number that is sorted.
+    /// Records the sort. `groups` is at least the [`blocks`] of the sorted elements, `passes` the constants of each
+    /// [`SortPass`], `scan_length` the [`table_len`] of their number.
     pub(crate) fn encode(
         &self,
         gpu: &GpuContext,

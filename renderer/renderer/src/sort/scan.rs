@@ -6,10 +6,10 @@ use wgpu::{BindGroup, BindingResource, ComputePass};
 const SCAN_WGSL: &str = include_str!("scan.wgsl");
 /// Workgroups that share a scan.
 pub(crate) const SEGMENTS: u32 = 128;
-/// Sums stop here: two of them do not overflow.
+/// Saturation of sums, such that two of them do not overflow.
 const MOST: u32 = (1 << 31) - 1;
 
-/// Exclusive prefix sum in place, in two kernels, with one contiguous segment a workgroup. Sums stop at 2³¹ - 1.
+/// Exclusive prefix sum in place, in two kernels, with one contiguous segment per workgroup. Sums saturate at 2³¹ - 1.
 #[derive(Debug)]
 pub(crate) struct Scan {
     reduce: ComputeKernel,
@@ -28,8 +28,8 @@ impl Scan {
         })
     }
 
-    /// Scans the first elements of `values`, as many as the constants `length` says (a `vec4<u32>`, x),
-    /// and writes their sum to `total[0]`.
+    /// Records the scan of the first elements of `values`, whose number is in `length` (x of a `vec4<u32>`), and writes
+    /// their sum to `total[0]`.
     pub(crate) fn encode(
         &self,
         gpu: &GpuContext,
@@ -50,12 +50,12 @@ pub(crate) fn scan_wgsl() -> String {
     format!("const SEGMENTS: u32 = {SEGMENTS}u;\nconst MOST: u32 = {MOST}u;\n{SCAN_WGSL}")
 }
 
-/// How many workgroups a dispatch has.
+/// Number of workgroups of a dispatch.
 #[derive(Debug, Clone, Copy)]
 pub(crate) enum Workgroups<'a> {
-    /// In x and y.
+    /// Number in x and y.
     Fixed(u32, u32),
-    /// As three numbers in a buffer say, from this byte on.
+    /// Three numbers in a buffer, from this byte on.
     Counted(&'a StorageBuffer<u32>, u64),
 }
 
@@ -65,7 +65,7 @@ impl From<(u32, u32)> for Workgroups<'_> {
     }
 }
 
-/// Binds and dispatches one kernel.
+/// Binds a kernel's resources and records its dispatch.
 pub(crate) fn run<'a>(
     gpu: &GpuContext,
     pass: &mut ComputePass<'_>,
@@ -76,7 +76,7 @@ pub(crate) fn run<'a>(
     dispatch(gpu, pass, kernel, &kernel.bind(gpu, resources), groups.into());
 }
 
-/// As [`run`], with bindings whose numbers do not follow each other.
+/// Records a dispatch as [`run`] does, with explicit binding numbers.
 pub(crate) fn run_at<'a>(
     gpu: &GpuContext,
     pass: &mut ComputePass<'_>,

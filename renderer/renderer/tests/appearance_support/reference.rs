@@ -18,7 +18,7 @@ struct Seen {
     closeness: f64,
 }
 
-/// What goes on from frame to frame.
+/// State that is carried from frame to frame.
 pub struct State {
     /// Colour, weight.
     pub memory: Vec<DVec4>,

@@ -9,7 +9,7 @@ use glam::{DQuat, DVec2, DVec3, Vec2, Vec3};
 const PARTS: [(DVec3, DVec3); 2] =
     [(DVec3::new(0.0, 1.0, 0.0), DVec3::new(0.25, 0.6, 0.2)), (DVec3::new(0.0, 1.1, 0.45), DVec3::new(0.1, 0.1, 0.1))];
 
-/// What does not change.
+/// Constant part of the scene.
 pub struct Person {
     pub surface: SurfaceGaussians,
     pub graph: DeformationGraph,
@@ -18,7 +18,7 @@ pub struct Person {
     pub body_count: usize,
 }
 
-/// How far the Gaussians lie below the surface that the cameras see, metres.
+/// Depth of the Gaussians below the surface that the cameras see, metres.
 pub const DEPTH_M: f32 = 0.004;
 
 /// The posed Gaussians of an instant.
@@ -29,7 +29,7 @@ pub struct Frame {
     pub normal: Vec<[f32; 4]>,
 }
 
-/// What a camera delivers.
+/// Images of one camera.
 #[derive(Clone)]
 pub struct View {
     pub camera: Camera,

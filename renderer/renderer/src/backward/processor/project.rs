@@ -90,15 +90,15 @@ pub(super) fn add_anisotropic(
     add(rotation_out, d_rotation * (2.0 * shape.inverse_length));
 }
 
-/// Adds what is finite.
+/// Adds finite values only.
 fn add(out: &mut [f32; 4], more: Vec4) {
     if more.is_finite() {
         *out = (Vec4::from(*out) + more).to_array();
     }
 }
 
-/// dL/d pixel and dL/d covariance before the filter, whose matrix root has these rows: through the conic, and through the opacity
-/// sqrt(det / filtered_det).
+/// Returns dL/d pixel and dL/d covariance before the filter, whose matrix root has these rows: through the conic, and
+/// through the opacity sqrt(det / filtered_det).
 fn through_ellipse(drawn: &RasterImage, sums: &PairSum, [row_x, row_y]: [Vec3; 2]) -> (Vec2, Mat2) {
     let [slope, slope_x, slope_y, _, xx_moment, xy_moment, yy_moment, ..] = *sums;
     let (xx, xy, yy) = (row_x.dot(row_x), row_x.dot(row_y), row_y.dot(row_y));
@@ -115,7 +115,7 @@ fn through_ellipse(drawn: &RasterImage, sums: &PairSum, [row_x, row_y]: [Vec3; 2
     (d_pixel, d_covariance)
 }
 
-/// A point in the image.
+/// Projection of a point and its derivatives.
 struct ProjectedPoint<'a> {
     camera: &'a CameraConstants,
     ideal: Vec2,
@@ -134,7 +134,7 @@ impl<'a> ProjectedPoint<'a> {
         Self { camera, ideal: p.truncate() * inverse_z, inverse_z, jacobian, world_from_camera }
     }
 
-    /// dL/d world position, given dL/d pixel, dL/d Jacobian by columns and dL/d depth.
+    /// Returns dL/d world position, given dL/d pixel, dL/d Jacobian by columns and dL/d depth.
     fn to_world(&self, d_pixel: Vec2, d_jacobian: [Vec2; 3], by_depth: f32) -> Vec3 {
         let Self { camera, ideal, inverse_z, jacobian: [along_x, along_y, along_z], .. } = *self;
         let focal = Vec2::from(camera.focal_px) * inverse_z;
@@ -154,7 +154,7 @@ impl<'a> ProjectedPoint<'a> {
     }
 }
 
-/// dL/d ideal through the lens's Jacobian, given dL/d Jacobian (columns as those of the Jacobian).
+/// Returns dL/d ideal image point through the lens's Jacobian, given dL/d Jacobian by columns.
 fn through_lens_jacobian(camera: &CameraConstants, ideal: Vec2, d: [Vec2; 2]) -> Vec2 {
     let Vec2 { x, y } = ideal;
     let r2 = ideal.length_squared();

@@ -6,13 +6,13 @@ use crate::raster::processor::project::{ProjectedSplat, TILE};
 use crate::raster::settings::Outputs;
 
 const ROWS: usize = TILE as usize;
-/// Splats after which it is looked whether every pixel is opaque.
+/// Number of splats between checks whether every pixel is opaque.
 const OPAQUE_EVERY: usize = 8;
 
-/// One number a pixel of a tile, row by row.
+/// One number per pixel of a tile, row by row.
 pub(crate) type TileLanes = [Lanes; ROWS];
 
-/// A tile while it is blended. Sums of weight times value; `coverage` the sum of the weights.
+/// Accumulators of a tile: sums of weight times value; `coverage` is the sum of the weights.
 #[derive(Debug, Clone)]
 pub(crate) struct BlendedTile {
     pub transmittance: TileLanes,
@@ -35,11 +35,11 @@ impl BlendedTile {
     }
 }
 
-/// Blends a tile's list front to back.
+/// Front-to-back blending of a tile's list.
 pub(crate) struct BlendTile<'a> {
-    /// First pixel.
+    /// First pixel of the tile.
     pub origin: [f32; 2],
-    /// Gaussians, nearest first.
+    /// Indices of Gaussians, nearest first.
     pub list: &'a [u32],
     pub splats: &'a [ProjectedSplat],
     pub color: &'a [[f32; 4]],
@@ -82,7 +82,7 @@ impl pulp::NullaryFnOnce for BlendTile<'_> {
     }
 }
 
-/// Rows of a tile that begins at pixel row `top` in which the splat can be seen.
+/// Returns the rows in which the splat is visible, of a tile that begins at pixel row `top`.
 #[inline(always)]
 pub(crate) fn rows_of(splat: &ProjectedSplat, top: f32) -> std::ops::Range<usize> {
     // `as` saturates: rows above the tile become 0.
@@ -91,7 +91,7 @@ pub(crate) fn rows_of(splat: &ProjectedSplat, top: f32) -> std::ops::Range<usize
     first..end.min(ROWS)
 }
 
-/// log2(alpha) of a splat at the pixels of a row.
+/// Computes log2(alpha) of a splat at the pixels of a row.
 #[inline(always)]
 pub(crate) fn exponents(splat: &ProjectedSplat, origin: [f32; 2], row: usize) -> Lanes {
     let dy = origin[1] + row as f32 - splat.pixel.y;
@@ -104,7 +104,8 @@ pub(crate) fn exponents(splat: &ProjectedSplat, origin: [f32; 2], row: usize) ->
     exponents
 }
 
-/// Weights of a splat at the pixels of a row, whose transmittance falls; None where it touches none.
+/// Returns the weights of a splat at the pixels of a row and reduces their transmittance; `None` where it touches no
+/// pixel.
 #[inline(always)]
 fn weigh(splat: &ProjectedSplat, origin: [f32; 2], row: usize, transmittance: &mut Lanes) -> Option<Lanes> {
     let exponents = exponents(splat, origin, row);
@@ -138,7 +139,7 @@ fn add(sum: &mut Lanes, weight: &Lanes, value: f32) {
     }
 }
 
-/// Whether every pixel of a tile is finished.
+/// Returns whether every pixel of a tile is finished.
 #[inline(always)]
 pub(crate) fn is_opaque(transmittance: &TileLanes) -> bool {
     let mut open = 0u32;

@@ -5,19 +5,19 @@ use std::array::from_fn;
 /// Pixels of a row that are computed together.
 pub(crate) const LANES: usize = 8;
 
-/// One number a pixel.
+/// One number per pixel.
 pub(crate) type Lanes = [f32; LANES];
 
-/// Runs `work` compiled for the best vector instructions that the processor has. The work must be inlined into the call,
-/// or it stays as it was compiled.
+/// Runs `work` compiled for the best vector instructions that the processor has. The work must be inlined into the call
+/// to benefit from them.
 #[inline]
 pub(crate) fn vectorized<W: pulp::NullaryFnOnce>(work: W) -> W::Output {
     pulp::Arch::new().dispatch(work)
 }
 
-/// 2^x for x from -100 to 100, to 2e-7 of the result; below, 2^-100.
+/// Computes 2^x for x from -100 to 100, with a relative error of 2e-7; below, 2^-100.
 ///
-/// No multiply-add: it rounds once where processors have it and twice where they have not, and the same input would give
+/// Uses no multiply-add: it rounds once on processors that have it and twice on others, so that equal input would give
 /// different bytes.
 #[inline(always)]
 pub(crate) fn exp2(x: f32) -> f32 {
@@ -37,7 +37,7 @@ pub(crate) fn exp2(x: f32) -> f32 {
     f32::from_bits(power.to_bits().wrapping_add(shifted.to_bits() << 23))
 }
 
-/// Sum of the lanes, in a fixed order.
+/// Sums the lanes in a fixed order.
 #[inline(always)]
 pub(crate) fn sum(lanes: &Lanes) -> f32 {
     let [a, b, c, d]: [f32; 4] = from_fn(|i| lanes[i] + lanes[i + 4]);

@@ -9,27 +9,27 @@ use crate::raster::buffers::pair_capacity;
 use crate::raster::processor::lanes::vectorized;
 use crate::raster::processor::project::{ProjectedSplat, Projection, Rect, TILE};
 
-/// Gaussians that one task projects.
+/// Gaussians per projection task.
 const CHUNK: usize = 4096;
-/// Bits of a pass of the radix sort, and passes: keys are sorted to so many bits of their range.
+/// Bits per pass of the radix sort, and number of passes: keys are sorted to their product, in bits of their range.
 const DIGIT_BITS: u32 = 12;
 const PASSES: u32 = 2;
 
-/// Gaussians that can be projected.
+/// Source of Gaussians to project.
 pub(crate) trait Source: Copy + Send + Sync {
-    /// Number of Gaussians.
+    /// Returns the number of Gaussians.
     fn count(&self) -> usize;
 
-    /// The splat of Gaussian `i` and its tiles; None where it is not drawn.
+    /// Projects Gaussian `i` to its splat and tiles; `None` where it is not drawn.
     fn splat(&self, projection: &Projection<'_>, i: usize) -> Option<(ProjectedSplat, Rect)>;
 
-    /// Colours that depend on the direction.
+    /// Returns the colours by direction, where the Gaussians have such.
     fn harmonics(&self) -> Option<Harmonics<'_>> {
         None
     }
 }
 
-/// The attributes of isotropic Gaussians, as in [`GaussianBuffers`](crate::GaussianBuffers).
+/// Attributes of isotropic Gaussians, as in [`GaussianBuffers`](crate::GaussianBuffers).
 #[derive(Clone, Copy)]
 pub(crate) struct Isotropic<'a> {
     pub center_scale: &'a [[f32; 4]],
@@ -49,7 +49,7 @@ impl Source for Isotropic<'_> {
     }
 }
 
-/// The attributes of anisotropic Gaussians, as in [`AnisotropicBuffers`](crate::AnisotropicBuffers).
+/// Attributes of anisotropic Gaussians, as in [`AnisotropicBuffers`](crate::AnisotropicBuffers).
 #[derive(Clone, Copy)]
 pub(crate) struct Anisotropic<'a> {
     pub colors: Harmonics<'a>,
@@ -72,46 +72,47 @@ impl Source for Anisotropic<'_> {
     }
 }
 
-/// A Gaussian on its way through the sort. It takes its rectangle along: looked up by Gaussian, the rectangles cost more than
-/// all else in the lists.
+/// Element of the sort. It carries its rectangle: looking rectangles up by Gaussian costs more than all other work on
+/// the lists.
 #[derive(Debug, Clone, Copy, Default)]
 struct Ranked {
-    /// Bits of the depth; those of positive floats sort as the floats do.
+    /// Bits of the depth, which sort as positive floats do.
     key: u32,
     gaussian: u32,
     rect: Rect,
 }
 
-/// Splats and tile lists of one image. Its arrays are used again by the next image.
+/// Splats and tile lists of one image. The next image reuses the arrays.
 #[derive(Debug, Default)]
 pub(crate) struct Lists {
-    /// By Gaussian; old where it is not drawn.
+    /// Splat per Gaussian; stale where the Gaussian is not drawn.
     pub splats: Vec<ProjectedSplat>,
-    /// Colours as the camera sees them, by Gaussian where they depend on the direction; old where one is not drawn.
+    /// Colour per Gaussian as seen from the camera, where colours depend on the direction; stale where the Gaussian is
+    /// not drawn.
     pub painted: Vec<[f32; 4]>,
-    /// RasterImage Gaussians of each chunk.
+    /// Drawn Gaussians of each chunk.
     visible: Vec<Vec<Ranked>>,
-    /// All of them, nearest first.
+    /// Drawn Gaussians, nearest first.
     order: Vec<Ranked>,
     scratch: Vec<Ranked>,
     /// Columns and rows of tiles.
     pub tiles: [u32; 2],
-    /// Where each tile's list begins in `pairs`, and the end.
+    /// Start of each tile's list in `pairs`, and the end of the last one.
     pub starts: Vec<u32>,
-    /// Gaussians by tile, nearest first.
+    /// Concatenated lists of Gaussians by tile, nearest first.
     pub pairs: Vec<u32>,
     /// Gaussians that touch the image.
     pub visible_gaussians: u32,
-    /// Pairs of a Gaussian and a tile that were wanted, at most one more than there is room for.
+    /// Pairs of a Gaussian and a tile that were required, at most one more than the capacity.
     pub wanted_pairs: u32,
-    /// Whether there was no room for all.
+    /// Whether the pairs exceeded the capacity.
     pub overflowed: bool,
     /// Run times of projection, sort and lists.
     pub times: [Duration; 3],
 }
 
 impl Lists {
-    /// Lists the Gaussians of an image.
+    /// Projects, sorts and lists the Gaussians of an image.
     pub fn fill(&mut self, projection: &Projection<'_>, gaussians: impl Source) {
         let start = Instant::now();
         self.project(projection, gaussians);
@@ -136,7 +137,7 @@ impl Lists {
         });
     }
 
-    /// Colours what is drawn. A colour that is not finite takes its Gaussian out of the image.
+    /// Computes the colours of drawn Gaussians. A Gaussian with a non-finite colour is not drawn.
     fn paint(&mut self, count: usize, harmonics: Harmonics<'_>) {
         self.painted.resize(count, [0.0; 4]);
         let chunks = self.painted.par_chunks_mut(CHUNK).zip(&mut self.visible);
@@ -150,7 +151,7 @@ impl Lists {
         });
     }
 
-    /// Stable radix sort by depth, to 24 bits of the range of the depths' bits.
+    /// Sorts by depth with a stable radix sort, to 24 bits of the range of the depths' bits.
     fn sort(&mut self) {
         self.order.clear();
         self.visible.iter().for_each(|visible| self.order.extend_from_slice(visible));
@@ -177,7 +178,7 @@ impl Lists {
         }
     }
 
-    /// Lists by tile. Where there is no room for all pairs, the farthest Gaussians are left out whole.
+    /// Builds the lists by tile. Where the pairs exceed the capacity, the farthest Gaussians are dropped entirely.
     fn bin(&mut self, size: [u32; 2], count: usize) {
         self.tiles = size.map(|side| side.div_ceil(TILE));
         let tiles = self.tiles[0] as usize * self.tiles[1] as usize;
@@ -235,13 +236,13 @@ impl Lists {
         });
     }
 
-    /// Positions in `pairs` of a tile's list.
+    /// Returns the range of a tile's list in `pairs`.
     pub fn range(&self, tile: usize) -> std::ops::Range<usize> {
         self.starts[tile] as usize..self.starts[tile + 1] as usize
     }
 }
 
-/// Projects the Gaussians from number `first` on.
+/// Projection of the Gaussians from number `first` on.
 struct ProjectChunk<'a, S> {
     projection: &'a Projection<'a>,
     gaussians: S,
@@ -266,7 +267,7 @@ impl<S: Source> pulp::NullaryFnOnce for ProjectChunk<'_, S> {
     }
 }
 
-/// Calls `with` for every tile of `rect` within a band of `rows` rows from `first_row` on: the tile's index in the band.
+/// Calls `with` with the index in the band of every tile of `rect`; the band has `rows` rows from `first_row` on.
 #[inline]
 fn each_tile(rect: &Rect, first_row: usize, rows: usize, columns: usize, mut with: impl FnMut(usize)) {
     let (top, bottom) =

@@ -1,4 +1,4 @@
-//! Gaussians to splats: `raster/project.wgsl` on the processor.
+//! Projection of Gaussians to splats: `raster/project.wgsl` on the processor.
 
 use flyrig_gpu::CameraConstants;
 use glam::{Vec2, Vec3, Vec4};
@@ -10,7 +10,7 @@ use crate::raster::settings::RasterSettings;
 /// Side of a tile, pixels.
 pub(crate) const TILE: u32 = crate::raster::processor::lanes::LANES as u32;
 
-/// A Gaussian in the image.
+/// Footprint of a Gaussian in the image.
 #[derive(Debug, Clone, Copy, Default)]
 pub(crate) struct ProjectedSplat {
     /// Centre, pixels.
@@ -33,7 +33,7 @@ pub(crate) struct Rect {
 }
 
 impl Rect {
-    /// Number of tiles.
+    /// Returns the number of tiles.
     pub fn tiles(&self) -> u32 {
         let side = |i: usize| u32::from(self.last[i]) - u32::from(self.first[i]) + 1;
         side(0) * side(1)
@@ -48,7 +48,7 @@ pub(crate) struct Projection<'a> {
 }
 
 impl Projection<'_> {
-    /// The splat of an isotropic Gaussian and its tiles; None where it is not drawn. Elements as in
+    /// Projects an isotropic Gaussian to its splat and tiles; `None` where it is not drawn. Elements as in
     /// [`GaussianBuffers`](crate::GaussianBuffers).
     #[inline(always)]
     pub fn isotropic(
@@ -84,7 +84,7 @@ impl Projection<'_> {
         self.splat(pixel, in_camera.z, rows_of(&jacobian).map(|row| row * scale), color[3])
     }
 
-    /// The splat of an anisotropic Gaussian and its tiles; None where it is not drawn. Elements as in
+    /// Projects an anisotropic Gaussian to its splat and tiles; `None` where it is not drawn. Elements as in
     /// [`AnisotropicBuffers`](crate::AnisotropicBuffers).
     #[inline(always)]
     pub fn anisotropic(
@@ -104,7 +104,7 @@ impl Projection<'_> {
         self.splat(pixel, in_camera.z, rows, shape.opacity)
     }
 
-    /// The splat whose covariance before the filter is the product of a matrix of these two rows with its transpose.
+    /// Returns the splat whose covariance before the filter is M M^T, with these rows of the 2x3 matrix M.
     #[inline(always)]
     fn splat(
         &self,

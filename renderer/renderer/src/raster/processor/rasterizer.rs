@@ -1,4 +1,4 @@
-//! Forward rasteriser.
+//! Forward rasteriser on the processor.
 
 use std::time::{Duration, Instant};
 
@@ -17,32 +17,32 @@ use crate::raster::processor::project::{Projection, TILE};
 use crate::raster::settings::{Latest, tile_range};
 use crate::raster::settings::{Outputs, RasterSettings, RasterStats};
 
-/// [`Rasterizer`](crate::Rasterizer) on the processor: draws when an image is recorded.
+/// [`Rasterizer`](crate::Rasterizer) on the processor: renders while an image is recorded.
 #[derive(Debug, Default)]
 pub(crate) struct ProcessorRasterizer {
     pub(crate) lists: Lists,
-    /// The image that was drawn last.
+    /// Image rendered last.
     pub(crate) latest: Option<RasterImage>,
     overflowed_images: u32,
     blend_time: Duration,
 }
 
-/// Parameters of an image that its derivative needs.
+/// Parameters of a rendered image that its derivative needs.
 #[derive(Debug, Clone)]
 pub(crate) struct RasterImage {
     pub camera: CameraConstants,
     pub size: [u32; 2],
     pub gaussians: usize,
-    /// Order of the colours; None for isotropic Gaussians.
+    /// Harmonic order of the colours; `None` for isotropic Gaussians.
     pub order: Option<HarmonicOrder>,
     pub settings: RasterSettings,
-    /// First tile that was blended, and columns and rows of them.
+    /// First blended tile; `blended` has columns and rows of blended tiles.
     pub first_tile: [u32; 2],
     pub blended: [u32; 2],
 }
 
 impl ProcessorRasterizer {
-    /// Draws an image. Arrays of the device are left as they are.
+    /// Renders an image. Does nothing for arrays that lie on a device.
     pub(crate) fn draw(
         &mut self,
         gaussians: Gaussians<'_>,
@@ -81,7 +81,7 @@ impl ProcessorRasterizer {
         self.latest = Some(RasterImage { camera: constants, size, gaussians, order, settings, first_tile, blended });
     }
 
-    /// Blends the lists into the images. Returns the first tile that was blended, and columns and rows of them.
+    /// Blends the lists into the images. Returns the first blended tile, and columns and rows of blended tiles.
     fn blend(
         &mut self,
         projection: &Projection<'_>,
@@ -158,7 +158,7 @@ impl ProcessorRasterizer {
     }
 }
 
-/// A row of tiles of the images; empty where one is not drawn.
+/// One row of tiles of each image; empty where the image is not written.
 #[derive(Default)]
 struct Band<'a> {
     color: &'a mut [[f32; 4]],

@@ -3,7 +3,7 @@
 use flyrig_gpu::CameraConstants;
 use glam::{Mat3, Mat4, Quat, Vec2, Vec3, Vec4};
 
-/// Scales, opacity and rotation, as far as they can be drawn.
+/// Valid scales, opacity and rotation of an anisotropic Gaussian.
 #[derive(Debug, Clone, Copy)]
 pub(crate) struct Shape {
     /// Standard deviations along the axes, metres.
@@ -11,12 +11,13 @@ pub(crate) struct Shape {
     pub opacity: f32,
     /// Quaternion x, y, z, w of length 1.
     pub unit: Vec4,
-    /// 1 / length of the quaternion that is stored.
+    /// 1 / length of the stored quaternion.
     pub inverse_length: f32,
 }
 
 impl Shape {
-    /// None where a number is not finite, a scale not above 0, or the quaternion too short or too long for f32.
+    /// Checks and normalises the stored attributes; `None` where a number is not finite, a scale not above 0, or the
+    /// quaternion too short or too long for f32.
     #[inline(always)]
     pub fn new(scale_opacity: &[f32; 4], rotation: &[f32; 4]) -> Option<Self> {
         let size = Vec4::from(*scale_opacity);
@@ -29,26 +30,26 @@ impl Shape {
         })
     }
 
-    /// Columns: unit vectors along the axes, in camera axes.
+    /// Returns the unit vectors along the Gaussian's axes as columns, in camera axes.
     #[inline(always)]
     pub fn axes_in_camera(&self, camera: &CameraConstants) -> Mat3 {
         camera_rotation(camera) * Mat3::from_quat(Quat::from_vec4(self.unit))
     }
 }
 
-/// Camera from world.
+/// Returns the rotation, camera from world.
 #[inline(always)]
 pub(crate) fn camera_rotation(camera: &CameraConstants) -> Mat3 {
     Mat3::from_mat4(Mat4::from_cols_array_2d(&camera.camera_from_world))
 }
 
-/// Rows of the projection's Jacobian, whose columns are d/dx, d/dy and d/dz.
+/// Returns the rows of the projection's Jacobian, given its columns d/dx, d/dy and d/dz.
 #[inline(always)]
 pub(crate) fn rows_of(&[dx, dy, dz]: &[Vec2; 3]) -> [Vec3; 2] {
     [Vec3::new(dx.x, dy.x, dz.x), Vec3::new(dx.y, dy.y, dz.y)]
 }
 
-/// [`rows_of`] in the basis of `axes`.
+/// Returns the rows of the Jacobian in the basis of `axes`.
 #[inline(always)]
 pub(crate) fn rows_along(jacobian: &[Vec2; 3], axes: &Mat3) -> [Vec3; 2] {
     rows_of(jacobian).map(|row| Vec3::new(axes.x_axis.dot(row), axes.y_axis.dot(row), axes.z_axis.dot(row)))
