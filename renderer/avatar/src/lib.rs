@@ -1,9 +1,9 @@
 //! Personal avatars: Gaussians of three scales on the surface of a person's body, fitted to the images of a take and driven by poses.
 //!
-//! An [`Avatar`] is a body with a skin, and for each Gaussian an offset, scales, a rotation, an opacity and a colour in canonical space
-//! ([`GaussianParameters`]). [`Avatar::pose`] brings them into the world by linear blend skinning, with or without a deformation graph's
-//! translations; [`Fit`] finds them by gradient descent on images, each number by itself or as outputs of local networks
-//! ([`Fit::use_networks`]).
+//! An [`Avatar`] is a body with skin weights, and for each Gaussian an offset, scales, a rotation, an opacity and a
+//! colour in canonical space ([`GaussianParameters`]). [`Avatar::pose`] transforms them to the world by linear blend
+//! skinning, with or without a deformation graph's translations; [`Fit`] optimises them by gradient descent on images,
+//! directly or as outputs of local networks ([`Fit::use_networks`]).
 
 mod edit;
 mod error;

@@ -1,4 +1,4 @@
-//! The avatar: attributes of its Gaussians, posing, light, files, and rendering.
+//! The avatar: attributes of its Gaussians, posing, light, files, rendering, and levels of detail for small images.
 
 pub(crate) mod avatar;
 mod coarser;

@@ -1,4 +1,4 @@
-//! One frame through the networks.
+//! Inference of the networks on one frame.
 
 use std::ops::Range;
 
@@ -18,21 +18,21 @@ use crate::{
     taps::{FeatureMaps, Taps},
 };
 
-/// Gaussians that go through the networks together.
+/// Gaussians per batch of the networks.
 const CHUNK: usize = if cfg!(test) { 1000 } else { 16_384 };
 
 /// Counts since the start.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]
 pub struct PaintCounts {
-    /// Images that were encoded.
+    /// Number of encoded images.
     pub views_encoded: u64,
-    /// Gaussians that went through the colour network.
+    /// Number of Gaussians that went through the colour network.
     pub colors_computed: u64,
-    /// Gaussians whose correction was not finite; they got the colour of direct appearance.
+    /// Number of Gaussians with a non-finite correction; they got the colour of direct appearance.
     pub poisoned: u64,
 }
 
-/// Paints every Gaussian: direct appearance and what the networks add to it.
+/// Painter of every Gaussian: direct appearance with the networks' corrections.
 #[derive(Debug)]
 pub struct LearnedAppearance {
     network: Network,
@@ -41,12 +41,12 @@ pub struct LearnedAppearance {
     place: Tensor<2>,
     edges: Tensor<1, Int>,
     memory: FeatureMemory,
-    /// What was done so far.
+    /// Counts so far.
     pub counts: PaintCounts,
 }
 
 impl LearnedAppearance {
-    /// For one body. The same weights serve every body.
+    /// Prepares the networks for one body. The same weights serve every body.
     #[must_use]
     pub fn new(parameters: &Parameters, body: BodyGraph) -> Self {
         let device = Device::flex();
@@ -64,7 +64,7 @@ impl LearnedAppearance {
         }
     }
 
-    /// Returns the features that were accumulated.
+    /// Returns the accumulated features.
     #[must_use]
     pub fn memory(&self) -> &FeatureMemory {
         &self.memory
@@ -87,11 +87,12 @@ impl LearnedAppearance {
         self.memory.clear();
     }
 
-    /// Linear RGB of every Gaussian (opacity 1) from what direct appearance observed with these settings in these images,
-    /// view by view. Without `settings.space` no graph network runs, without `settings.time` nothing is remembered.
+    /// Infers linear RGB of every Gaussian (opacity 1) from the observations of direct appearance with these settings
+    /// in these images, view by view. Without `settings.space` the graph network does not run, without `settings.time`
+    /// nothing is remembered.
     ///
     /// # Errors
-    /// [`StfaError::Frame`] when observations and images do not fit.
+    /// [`StfaError::Frame`] where observations and images do not fit.
     pub fn paint(
         &mut self,
         observed: &Observations,
@@ -136,7 +137,8 @@ impl LearnedAppearance {
         Ok(colors)
     }
 
-    /// What the colour network sees of some Gaussians, before the memory. Without `graph` nothing is filled in.
+    /// Computes the colour network's inputs for some Gaussians, before the memory. With an empty `graph` nothing is
+    /// inpainted.
     fn rows(
         &self,
         inputs: &FrameInputs,

@@ -89,7 +89,7 @@ impl Stage {
         rgba8_from_target(&target.color.read(&self.gpu).unwrap())
     }
 
-    /// What direct appearance paints and observes.
+    /// Runs direct appearance and returns its colours and observations.
     fn update(
         &mut self,
         cameras: &[Camera],

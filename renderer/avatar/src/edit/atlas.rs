@@ -8,54 +8,55 @@ use rayon::prelude::*;
 use crate::error::AvatarError;
 use crate::model::avatar::{Attachment, Avatar};
 
-/// Texels along a side: about 2 mm each on an adult.
+/// Default texels along a side: about 2 mm each on an adult.
 pub const DEFAULT_ATLAS_SIDE: u32 = 1024;
-/// Sides that can be.
+/// Range of texels along a side.
 const SIDES: std::ops::RangeInclusive<u32> = 16..=4096;
-/// A texel sees Gaussians as bell curves of so many of their own deviations: narrower than they are drawn, so that detail stays.
+/// Width of a Gaussian's kernel in the texture, in its own standard deviations: narrower than it is drawn, so that
+/// detail is preserved.
 pub(crate) const KERNEL: f32 = 0.6;
-/// Gaussians further away than so many mean distances do not count.
+/// Radius within which Gaussians contribute, in mean distances of neighbours.
 pub(crate) const REACH: f32 = 3.0;
-/// Share of what lies below that a Gaussian hides in its middle, and share that all must hide together for their mix to count.
+/// Opacity of a Gaussian at its centre, and least total opacity for a mix of Gaussians to be used.
 const MOST_ALPHA: f32 = 0.9;
 const LEAST_ALPHA: f32 = 0.05;
-/// Texels around covered ones that repeat their colours, so that smaller versions of the texture have no dark seams.
+/// Rings of texels around covered ones that repeat their colours, so that downsampled textures have no dark seams.
 const GUTTER: usize = 8;
-/// Texels that show no part of the body, sRGB.
+/// Colour of texels outside of the body, sRGB.
 const UNUSED: [u8; 3] = [128; 3];
 
-/// A point of the body's surface that a texel shows.
+/// Point of the body's surface that a texel shows.
 #[derive(Debug, Clone, Copy)]
 pub(crate) struct Texel {
-    /// Row by row.
+    /// Index of the texel, row by row.
     pub index: u32,
-    /// Canonical, metres.
+    /// Canonical position, metres.
     pub place: Vec3,
     pub normal: Vec3,
     pub attachment: Attachment,
 }
 
 impl Texel {
-    /// Its bytes in an image of its size.
+    /// Returns the range of its bytes in an image of the texture's size.
     pub fn bytes<'a>(&self, rgb: &'a [u8]) -> &'a [u8] {
         rgb.get(3 * self.index as usize..3 * self.index as usize + 3).unwrap_or_default()
     }
 }
 
-/// Colours of the whole body, sRGB.
+/// Texture of the whole body, sRGB.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct Atlas {
     /// Texels along a side.
     pub side: u32,
-    /// Rows from the top, three bytes a texel.
+    /// Rows from the top, three bytes per texel.
     pub rgb: Vec<u8>,
-    /// Texels that show the body.
+    /// Number of texels that show the body.
     pub covered: usize,
 }
 
-/// Gaussians as a texture sees them.
+/// Gaussian reduced to the attributes that a texture needs.
 pub(crate) struct Shown {
-    /// On the surface, moved along it as the Gaussian is, canonical metres.
+    /// Canonical position on the surface, with the Gaussian's tangential offset, metres.
     pub place: Vec<Vec3>,
     pub normal: Vec<Vec3>,
     /// Height of the centre above the surface, metres.
@@ -86,8 +87,8 @@ impl Shown {
         Self { place, height, deviation: deviation.collect(), normal: normals }
     }
 
-    /// Linear colour of the surface at a canonical place with this normal, of Gaussians within `radius`; None where none faces the same
-    /// way. `grid` holds their places, `colors` are linear RGB.
+    /// Returns the linear colour of the surface at a canonical position with this normal, from Gaussians within
+    /// `radius`; `None` where none faces the same way. `grid` holds their positions, `colors` are linear RGB.
     pub fn color_at(
         &self,
         grid: &PointGrid<'_>,
@@ -104,17 +105,17 @@ impl Shown {
         composite(near, self, colors)
     }
 
-    /// Mean distance of neighbours, metres.
+    /// Returns the mean distance of neighbours, metres.
     pub fn spacing(&self, avatar: &Avatar) -> f32 {
         (avatar.template.area_m2() / self.place.len().max(1) as f64).sqrt() as f32
     }
 }
 
 impl Avatar {
-    /// Draws the colours of all Gaussians, of order zero, into a texture. The same avatar gives the same bytes.
+    /// Renders the colours of all Gaussians, of order zero, into a texture. Equal avatars give equal bytes.
     ///
     /// # Errors
-    /// [`AvatarError::Texture`] for a side outside of 16..=4096, and a body without texture coordinates.
+    /// [`AvatarError::Texture`] for a side outside of 16..=4096 and for a body without texture coordinates.
     pub fn atlas(&self, side: u32) -> Result<Atlas, AvatarError> {
         let texels = self.texels(side)?;
         let shown = Shown::of(self);
@@ -132,14 +133,15 @@ impl Avatar {
         Ok(Atlas { side, rgb, covered: texels.len() })
     }
 
-    /// Linear colours of order zero.
+    /// Returns the linear colours of order zero.
     pub(crate) fn constant_colors(&self) -> Vec<Vec3> {
         let coefficients = self.parameters.order().coefficients();
         let rows = self.parameters.harmonics.chunks(coefficients);
         rows.map(|rows| rows.first().map_or(Vec3::ZERO, |[r, g, b, _]| SH_DEGREE_0 * Vec3::new(*r, *g, *b))).collect()
     }
 
-    /// Points of the surface that texels show, in the order of triangles. Where two triangles share a texel, the first one counts.
+    /// Returns the surface points that texels show, in the order of triangles. Where two triangles share a texel, the
+    /// first one wins.
     pub(crate) fn texels(&self, side: u32) -> Result<Vec<Texel>, AvatarError> {
         if !SIDES.contains(&side) {
             let (least, most) = (SIDES.start(), SIDES.end());
@@ -175,7 +177,8 @@ impl Avatar {
     }
 }
 
-/// Linear colour of Gaussians as they are seen along the normal: rows of height, Gaussian, squared distance along the surface.
+/// Composites the linear colour of Gaussians seen along the normal, from rows of height, Gaussian and squared distance
+/// along the surface.
 fn composite(mut near: Vec<(f32, usize, f32)>, shown: &Shown, colors: &[Vec3]) -> Option<Vec3> {
     near.sort_by(|a, b| b.0.total_cmp(&a.0).then(a.1.cmp(&b.1)));
     let (mut sum, mut left) = (Vec3::ZERO, 1.0);
@@ -213,7 +216,7 @@ fn each_texel([a, b, c]: [Vec2; 3], side: u32, mut visit: impl FnMut(usize, [f32
     }
 }
 
-/// Repeats colours outwards, ring by ring.
+/// Extends colours outwards, ring by ring.
 fn grow(image: &mut [Option<[u8; 3]>], side: usize) {
     for _ in 0..GUTTER {
         let before = image.to_vec();
@@ -234,7 +237,7 @@ fn encode(linear: Vec3) -> [u8; 3] {
     linear.to_array().map(|value| (255.0 * srgb_from_linear(value) + 0.5) as u8)
 }
 
-/// Linear colour of three bytes.
+/// Converts three bytes to linear colour.
 pub(crate) fn decode(rgb: &[u8]) -> Vec3 {
     let value = |k: usize| linear_from_srgb(rgb.get(k).map_or(0.0, |byte| f32::from(*byte) / 255.0));
     Vec3::new(value(0), value(1), value(2))
@@ -245,7 +248,7 @@ mod tests {
     use super::*;
     use crate::model::avatar::tests::small;
 
-    /// A plain, slow reference: every Gaussian for every texel, in f64.
+    /// Slow reference: every Gaussian for every texel, in f64.
     #[test]
     fn texels_mix_the_gaussians_near_them() {
         let mut avatar = small(800, 5);

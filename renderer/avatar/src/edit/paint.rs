@@ -1,7 +1,7 @@
-//! An edited texture, brought back onto the Gaussians.
+//! Transfer of an edited texture to the Gaussians.
 //!
-//! Only texels that differ from those of [`Avatar::atlas`] count, so an untouched texture changes nothing. Where an edit has more detail than
-//! a Gaussian can show, small ones are laid over it.
+//! Only texels that differ from those of [`Avatar::atlas`] are used, so an unedited texture changes nothing. Where an
+//! edit has more detail than a Gaussian can show, small Gaussians are added on top.
 
 use flyrig_body::{PointGrid, SkinWeights, Template};
 use flyrig_renderer::SH_DEGREE_0;
@@ -11,46 +11,47 @@ use crate::edit::atlas::{Atlas, KERNEL, Shown, Texel, decode};
 use crate::error::AvatarError;
 use crate::model::avatar::{Attachment, Avatar};
 
-/// Texels within so many deviations of a Gaussian belong to it.
+/// Radius of the texels that belong to a Gaussian, in its standard deviations.
 const REACH: f32 = 1.5;
-/// Shares of changed texels below this do not count.
+/// Share of changed texels below which a Gaussian is unchanged.
 const LEAST_SHARE: f32 = 0.02;
-/// Edited colours that differ by more than this within a Gaussian are laid over it by small ones, sRGB of 255.
+/// Range of edited colours within a Gaussian above which small ones are added on top, sRGB of 255.
 const CONTRAST: u8 = 16;
-/// Distance of small Gaussians against that of all others, at least; and in texels.
+/// Least distance of small Gaussians relative to that of all others, and in texels.
 const FINER: f32 = 0.2;
 const TEXELS: f32 = 0.8;
-/// Deviation of a small Gaussian over the distance to its nearest neighbour, as surfaces are sampled; thickness over deviation.
+/// Standard deviation of a small Gaussian over the distance to its nearest neighbour, as in the sampling of surfaces;
+/// thickness over standard deviation.
 const DEVIATION: f32 = 0.975;
 const THICKNESS: f32 = 0.5;
 /// Logit of the opacity of small Gaussians.
 const OPAQUE: f32 = 4.6;
-/// A Gaussian below small ones is moved in by so many of its deviations.
+/// Displacement inwards of a Gaussian below small ones, in its standard deviations.
 const BELOW: f32 = 0.5;
 
-/// Extent of an edit.
+/// Statistics of an edit.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]
 pub struct Painted {
-    /// Texels of the body that differ.
+    /// Number of differing texels of the body.
     pub texels: usize,
-    /// Gaussians whose colours changed.
+    /// Number of Gaussians whose colours changed.
     pub recolored: usize,
-    /// Gaussians that were added for detail.
+    /// Number of Gaussians added for detail.
     pub added: usize,
 }
 
-/// Texels near a point of the surface, in the edited texture.
+/// Statistics of the edited texture near a point of the surface.
 struct Around {
     /// Share of changed texels, 0 to 1.
     share: f32,
-    /// Mean of the changed ones, and of all, linear.
+    /// Mean of the changed texels, and of all, linear.
     changed: Vec3,
     all: Vec3,
-    /// Range of all, sRGB.
+    /// Range of all texels, sRGB.
     contrast: u8,
 }
 
-/// The body's texels with their edited colours.
+/// Texels of the body with their edited colours.
 struct Canvas<'a> {
     texels: &'a [Texel],
     is_changed: Vec<bool>,
@@ -59,10 +60,10 @@ struct Canvas<'a> {
 }
 
 impl Avatar {
-    /// Takes over the texels of `edited` that differ from the avatar's own texture of that size.
+    /// Applies the texels of `edited` that differ from the avatar's own texture of that size.
     ///
     /// # Errors
-    /// [`AvatarError::Texture`] as of [`Avatar::atlas`], and for bytes that are not of the size.
+    /// [`AvatarError::Texture`] as for [`Avatar::atlas`], and for bytes of another size.
     pub fn paint(&mut self, edited: &Atlas) -> Result<Painted, AvatarError> {
         let own = self.atlas(edited.side)?;
         if own.rgb.len() != edited.rgb.len() {
@@ -110,7 +111,7 @@ impl Avatar {
         Ok(painted)
     }
 
-    /// Colours a Gaussian by the changed texels around it.
+    /// Recolours a Gaussian by the changed texels around it.
     fn recolor(&mut self, i: usize, around: &Around) {
         let coefficients = self.parameters.order().coefficients();
         let rows = &mut self.parameters.harmonics[i * coefficients..(i + 1) * coefficients];
@@ -122,7 +123,7 @@ impl Avatar {
         }
     }
 
-    /// Adds a flat Gaussian at a texel, `height` metres above the surface, that hangs on the graph as `parent` does.
+    /// Adds a flat Gaussian at a texel, `height` metres above the surface, with the graph nodes of `parent`.
     fn add(&mut self, texel: &Texel, parent: usize, height: f32, deviation: f32, color: Vec3) {
         self.places.push(texel.place + height * texel.normal);
         self.attachments.push(texel.attachment);
@@ -141,7 +142,7 @@ impl Avatar {
 }
 
 impl Canvas<'_> {
-    /// Visits the texels near a point, those of the other side of a thin part left out.
+    /// Visits the texels near a point, except those on the other side of a thin part.
     fn each(&self, place: Vec3, normal: Vec3, radius: f32, mut visit: impl FnMut(usize, f32)) {
         self.grid.within(place, radius, |texel, squared| {
             if self.texels[texel].normal.dot(normal) > 0.0 {
@@ -150,7 +151,7 @@ impl Canvas<'_> {
         });
     }
 
-    /// Mixes the texels around a point; None where there is none.
+    /// Averages the texels around a point; `None` where there is none.
     fn around(&self, place: Vec3, normal: Vec3, deviation: f32) -> Option<Around> {
         let (mut sums, mut weights) = ([Vec3::ZERO; 2], [0.0; 2]);
         let (mut low, mut high) = ([u8::MAX; 3], [0; 3]);
@@ -173,7 +174,7 @@ impl Canvas<'_> {
     }
 }
 
-/// Chooses texels so that none is closer to another than `apart`, in order.
+/// Selects texels in order so that no two are closer than `apart`.
 fn spread<'a>(texels: &'a [Texel], is_wanted: &[bool], apart: f32) -> Vec<&'a Texel> {
     let cell = |place: Vec3| (place / apart).floor().as_ivec3();
     let mut taken: std::collections::HashMap<glam::IVec3, Vec<Vec3>> = std::collections::HashMap::new();
@@ -190,7 +191,7 @@ fn spread<'a>(texels: &'a [Texel], is_wanted: &[bool], apart: f32) -> Vec<&'a Te
     chosen
 }
 
-/// The Gaussian nearest to a point of the surface, and the mean height above it of those near, metres.
+/// Returns the Gaussian nearest to a point of the surface, and the mean height above it of those near, metres.
 fn height(grid: &PointGrid<'_>, shown: &Shown, place: Vec3, normal: Vec3, spacing: f32) -> Option<(usize, f32)> {
     let mut nearest = None;
     let (mut sum, mut weights) = (0.0, 0.0);
@@ -234,7 +235,7 @@ mod tests {
         assert!(avatar.to_bytes().unwrap() == before.to_bytes().unwrap());
     }
 
-    /// A red square with a white middle at the chest.
+    /// Paints a red square with a white middle at the chest.
     #[test]
     fn an_emblem_shows_in_the_next_texture_and_nothing_else_changes() {
         let mut avatar = small(6000, 20);

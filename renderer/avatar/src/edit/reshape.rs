@@ -1,4 +1,4 @@
-//! Another shape for an avatar (LoGAvatar, section 5.4).
+//! Change of an avatar's shape (LoGAvatar, section 5.4).
 
 use flyrig_body::{PointGrid, ShapeParams, Template};
 use glam::{Mat3, Quat, Vec3};
@@ -6,12 +6,12 @@ use glam::{Mat3, Quat, Vec3};
 use crate::error::AvatarError;
 use crate::model::avatar::{Attachment, Avatar};
 
-/// The nodes of the graph lie on the surface; their vertex is looked for within this distance, metres, then twice it, and so on.
+/// First search radius for the vertex of a graph node, which lies on the surface, metres; doubled until one is found.
 const NEAR_M: f32 = 0.02;
 
 impl Avatar {
-    /// Changes the body's shape: see [`Template::reshape`] for the targets and how exact it is. Gaussians move with the triangles that they
-    /// hang on, turn with them, and grow as they do; colours stay.
+    /// Changes the body's shape: see [`Template::reshape`] for the targets and their accuracy. Gaussians move, turn and
+    /// grow with the triangles that they are attached to; colours are unchanged.
     ///
     /// # Errors
     /// [`AvatarError::Body`] for unknown targets, weights out of range, and bodies whose shape cannot be edited.
@@ -40,7 +40,7 @@ impl Avatar {
     }
 }
 
-/// Displacement of the vertex nearest to a point; zero where there is none within a metre.
+/// Returns the displacement of the vertex nearest to a point; zero without one within a metre.
 fn displacement_near(grid: &PointGrid<'_>, point: Vec3, displacement: &[Vec3]) -> Vec3 {
     let mut radius = NEAR_M;
     while radius < 1.0 {
@@ -58,7 +58,7 @@ fn displacement_near(grid: &PointGrid<'_>, point: Vec3, displacement: &[Vec3]) -
     Vec3::ZERO
 }
 
-/// By how much a triangle turns, and the side of a square on it grows.
+/// Returns the rotation of a triangle, and the growth of the side of a square on it.
 fn change_of(old: &Template, new: &Template, attachment: Attachment) -> (Quat, f32) {
     let frame = |template: &Template| {
         let [a, b, c] = template.triangles[attachment.triangle as usize].map(|i| template.positions[i as usize]);

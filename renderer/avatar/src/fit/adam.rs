@@ -1,7 +1,8 @@
-//! Adam (Kingma and Ba 2015), for lists of four numbers each.
+//! Adam (Kingma and Ba 2015) for lists of elements of four numbers.
 //!
-//! Its steps do not depend on the size of derivatives: a Gaussian that hardly shows would move as far as any other, by noise. Here the
-//! constant in the denominator is a share of the derivatives' usual size in the list, so that such a Gaussian moves little.
+//! Adam's steps do not depend on the size of derivatives, so that a hardly visible Gaussian would move as far as any
+//! other, driven by noise. Here the constant in the denominator is a share of the derivatives' usual size in the list,
+//! so that such a Gaussian moves little.
 
 use rayon::prelude::*;
 
@@ -10,12 +11,12 @@ use crate::model::parameters::Element;
 const BETA_1: f32 = 0.9;
 const BETA_2: f32 = 0.999;
 const EPSILON: f32 = 1e-15;
-/// Of the root mean square of a column's derivatives, added in the denominator.
+/// Share of the root mean square of a column's derivatives that is added in the denominator.
 const SHARE_OF_USUAL: f32 = 0.3;
-/// Elements that one thread updates at once.
+/// Elements per task.
 const CHUNK: usize = 4096;
 
-/// Moments of one list.
+/// Adam's moments of one list.
 #[derive(Debug, Clone, Default)]
 pub(crate) struct Adam {
     first: Vec<Element>,
@@ -27,12 +28,12 @@ impl Adam {
         Self { first: vec![[0.0; 4]; len], second: vec![[0.0; 4]; len] }
     }
 
-    /// Both moments, the first one first.
+    /// Returns both moments, the first one first.
     pub fn lists_mut(&mut self) -> [&mut [Element]; 2] {
         [&mut self.first, &mut self.second]
     }
 
-    /// Mean square of the derivatives of each column, over the rows that ever had one.
+    /// Returns the mean square of the derivatives per column, over the rows that ever had one.
     pub fn usual(&self) -> Element {
         let (mut sum, mut count) = ([0.0f64; 4], [0u32; 4]);
         for row in &self.second {
@@ -44,7 +45,8 @@ impl Adam {
         std::array::from_fn(|k| (sum[k] / f64::from(count[k].max(1))) as f32)
     }
 
-    /// Descends by one step; `step` counts from 1, `rates` are those of the four columns. A derivative that is not finite counts as zero.
+    /// Descends by one step; `step` counts from 1, `rates` are those of the four columns. Non-finite derivatives count
+    /// as zero.
     pub fn descend(&mut self, step: u64, rates: Element, values: &mut [Element], derivatives: &[Element]) {
         let step = step.min(1 << 20) as i32;
         let (correct_1, correct_2) = (1.0 - BETA_1.powi(step), 1.0 - BETA_2.powi(step));
@@ -86,7 +88,7 @@ mod tests {
         assert!((values[7][0] - 3.0).abs() < 1e-6);
     }
 
-    /// The formula as it is published, but for the denominator, in f64.
+    /// Reference in f64: the published formula except for the denominator.
     #[test]
     fn steps_are_those_of_the_formula() {
         let slopes = [0.5f64, -0.2, 0.1, 0.7, -1.5];

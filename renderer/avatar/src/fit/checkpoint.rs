@@ -1,4 +1,4 @@
-//! State of a fit between two steps: one that was killed goes on from there, and ends with the bytes of one that was not.
+//! State of a fit between two steps: a fit that resumes from it ends with the same bytes as an uninterrupted one.
 
 use std::collections::HashMap;
 
@@ -12,22 +12,22 @@ use crate::model::avatar::Avatar;
 /// Key of the description in the file's metadata.
 const HEADER: &str = "flyrig-fit";
 
-/// Steps of a fit that are done, and steps that it is to have.
+/// Progress of a fit: completed steps and total.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
 pub struct FitProgress {
-    /// Description of take and settings; another one is another fit.
+    /// Description of take and settings; a state with another description is rejected.
     pub settings: String,
-    /// Steps that are done.
+    /// Completed steps.
     pub done: u64,
-    /// Steps in all.
+    /// Total steps.
     pub total: u64,
 }
 
 impl Fit {
-    /// Returns the state after the last step as a file's bytes, with the avatar as it is then.
+    /// Returns the state after the last step, including the avatar, as a file's bytes.
     ///
     /// # Errors
-    /// [`AvatarError::Format`] for a description that cannot be written.
+    /// [`AvatarError::Format`] for a description that cannot be serialised.
     pub fn checkpoint(&mut self, avatar: &mut Avatar, settings: &str, total: u64) -> Result<Vec<u8>, AvatarError> {
         let fail = |problem: String| AvatarError::Format { path: "checkpoint".into(), problem };
         let progress = FitProgress { settings: settings.to_owned(), done: self.step, total };
@@ -45,10 +45,10 @@ impl Fit {
             .map_err(|error| fail(error.to_string()))
     }
 
-    /// Takes the state of a [`Self::checkpoint`] over. Nothing is changed where it is refused.
+    /// Restores the state of a [`Self::checkpoint`]. A rejected state changes nothing.
     ///
     /// # Errors
-    /// Text: the file is none, it is damaged, or it is of another take or of other settings.
+    /// A text where the bytes are no state, are damaged, or belong to another take or other settings.
     pub fn resume(&mut self, avatar: &mut Avatar, bytes: &[u8], settings: &str) -> Result<FitProgress, String> {
         let none = || "is no state of a fit".to_owned();
         let (_, metadata) = SafeTensors::read_metadata(bytes).map_err(|_| none())?;
@@ -84,7 +84,7 @@ impl Fit {
         Ok(progress)
     }
 
-    /// All numbers that change from step to step, by name.
+    /// Returns all numbers that change from step to step, by name.
     fn state<'a>(&'a mut self, avatar: &'a mut Avatar) -> Vec<(String, &'a mut [f32])> {
         let mut all = Vec::new();
         for (number, list) in avatar.parameters.lists_mut().into_iter().enumerate() {

@@ -1,4 +1,4 @@
-//! Gradient descent on the images of a take.
+//! Gradient descent of an avatar on the images of a take.
 
 use std::collections::{BTreeMap, btree_map::Entry};
 
@@ -25,41 +25,42 @@ use crate::model::parameters::Element;
 use crate::model::posing::{Bones, PosedAvatar};
 use crate::model::scene::AvatarBuffers;
 
-/// Differences to neighbours of the lists' columns at which their pull is as strong as images usually are. Rotations do not pull: a
-/// quaternion and its negative are the same.
+/// Difference to the neighbours, per list and column, at which their pull equals the usual derivative of the images.
+/// Rotations are not pulled, since a quaternion and its negative are the same rotation.
 const DIFFERENCES: [Element; 4] =
     [[5e-3, 5e-3, 5e-3, f32::INFINITY], [0.7, 0.7, 0.7, 1.0], [f32::INFINITY; 4], [0.7, 0.7, 0.7, f32::INFINITY]];
-/// Colours of higher orders than zero move more slowly.
+/// Factor on the derivatives of colours of higher orders than zero.
 const HIGHER: f32 = 0.05;
 
-/// Keeps the rounds of one seed apart from those of the next ones.
+/// Multiplier of the round in the seed of its order, which separates the rounds of consecutive seeds.
 const ROUND_SEED: u64 = 0x9e37_79b9_7f4a_7c15;
 
-/// How an avatar is learnt.
+/// Settings of a fit.
 #[derive(Debug, Clone, PartialEq)]
 pub struct FitSettings {
     /// Seed of the order of images.
     pub seed: u64,
-    /// Parts of the error.
+    /// Weights of the error's terms.
     pub weights: ErrorWeights,
-    /// Rates of the offset, of logarithms of scales, the opacity's logit, rotations and colours: at the start and at the end.
+    /// Rate of offsets at the start and at the end, metres. All rates fall geometrically in between.
     pub offset_rate_m: [f32; 2],
-    /// Of logarithms of scales.
+    /// Rate of logarithms of scales.
     pub scale_rate: [f32; 2],
-    /// Of logits of opacities.
+    /// Rate of logits of opacities.
     pub opacity_rate: [f32; 2],
-    /// Of quaternions.
+    /// Rate of quaternions.
     pub rotation_rate: [f32; 2],
-    /// Of coefficients of colours.
+    /// Rate of colour coefficients.
     pub color_rate: [f32; 2],
-    /// How much neighbours pull each other; 0 for not at all. At 1 the pull is as strong as images usually are where an offset differs by
-    /// 5 mm from the neighbours', a scale by a factor of two, a colour by a fifth of the range.
+    /// Strength of the pull between neighbours; 0 for none. At 1 the pull equals the usual derivative of the images
+    /// where an offset differs by 5 mm from the neighbours', a scale by a factor of two, a colour by a fifth of the
+    /// range.
     pub pull: f32,
-    /// Whether the room's light is learnt.
+    /// Whether the room's light is learned.
     pub light: bool,
-    /// Whether each frame's pose is corrected while the avatar is learnt.
+    /// Whether each frame's pose is corrected during the fit.
     pub refine_poses: bool,
-    /// Whether the skin weights are corrected.
+    /// Whether the skin weights are corrected during the fit.
     pub skin_correction: bool,
 }
 
@@ -81,10 +82,10 @@ impl Default for FitSettings {
     }
 }
 
-/// A person at one instant.
+/// Person at one instant of the take.
 #[derive(Debug, Clone)]
 pub struct TrainingFrame {
-    /// Its pose.
+    /// Pose of the skeleton.
     pub pose: Pose,
     /// Translations of the graph's nodes, canonical metres; empty without a graph.
     pub translations: Vec<DVec3>,
@@ -93,13 +94,13 @@ pub struct TrainingFrame {
 /// Result of one step.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct StepReport {
-    /// Weighted error of what was drawn of the step's image, as a part of the whole image's.
+    /// Weighted error of the step's image.
     pub loss: f64,
-    /// PSNR of what was drawn of it, decibels.
+    /// PSNR of the step's image, decibels.
     pub decibels: f64,
 }
 
-/// Images of one size on the adapter.
+/// Rendered image and its derivatives, of one size, on the adapter.
 #[derive(Debug)]
 struct Targets {
     drawn: RenderTarget,
@@ -113,7 +114,7 @@ impl Targets {
     }
 }
 
-/// Fits an avatar to images.
+/// Fit of an avatar to the images of its take.
 #[derive(Debug)]
 pub struct Fit {
     gpu: GpuContext,
@@ -128,23 +129,23 @@ pub struct Fit {
     posed: PosedAvatar,
     pub(crate) moments: [Adam; 4],
     pub(crate) light: LightFit,
-    /// None where poses stay as they are.
+    /// `None` where poses are not corrected.
     pub(crate) poses: Option<PoseFit>,
-    /// None where skin weights stay as they are.
+    /// `None` where skin weights are not corrected.
     pub(crate) skin: Option<SkinFit>,
     neighbors: Neighbors,
-    /// Networks whose outputs the lists are; None where the lists themselves are learnt.
+    /// Networks that predict the lists; `None` where the lists themselves are learned.
     pub(crate) local: Option<Local>,
     pub(crate) step: u64,
-    /// Views in the order of a round, and its number.
+    /// Views in the order of a round, and the round's number.
     round: (Vec<usize>, u64),
 }
 
 impl Fit {
-    /// For an avatar and the images of its take.
+    /// Prepares the fit of an avatar to the images of its take.
     ///
     /// # Errors
-    /// [`AvatarError::Images`] without an image, or with one of a frame that does not exist; [`AvatarError::Gpu`].
+    /// [`AvatarError::Images`] without an image, or for an image of a missing frame; [`AvatarError::Gpu`].
     pub fn new(
         gpu: &GpuContext,
         avatar: &Avatar,
@@ -187,12 +188,13 @@ impl Fit {
         })
     }
 
-    /// Makes the avatar's lists outputs of local networks, which are learnt in their place, and returns how many numbers these have. The
-    /// lists start as they are, but for colours, which are looked up in an atlas. Lists whose networks the settings leave out are learnt by
-    /// themselves. `uvs`: texture coordinates of the Gaussians, empty without any.
+    /// Replaces the avatar's lists by outputs of local networks, which are learned instead, and returns the number of
+    /// their parameters. The lists keep their values, except for colours, which are looked up in an atlas. Lists
+    /// without a network in the settings are learned directly. `uvs` are the Gaussians' texture coordinates; empty
+    /// without any.
     ///
     /// # Errors
-    /// [`AvatarError::Images`] where an atlas by texture coordinates is asked for and there are none.
+    /// [`AvatarError::Images`] for an atlas by texture coordinates without texture coordinates.
     pub fn use_networks(
         &mut self,
         avatar: &mut Avatar,
@@ -206,20 +208,20 @@ impl Fit {
         Ok(numbers)
     }
 
-    /// Number of images.
+    /// Returns the number of images.
     #[must_use]
     pub fn images(&self) -> usize {
         self.views.len()
     }
 
-    /// Returns the pose of a frame as it is corrected so far; None for a frame that does not exist.
+    /// Returns the corrected pose of a frame; `None` for a missing frame.
     #[must_use]
     pub fn pose(&self, frame: usize) -> Option<Pose> {
         let pose = &self.frames.get(frame)?.pose;
         Some(self.poses.as_ref().map_or_else(|| pose.clone(), |poses| poses.corrected(frame, pose)))
     }
 
-    /// Descends by one step on the next image; `progress` in 0..=1 is the part of all steps that is done.
+    /// Descends by one step on the next image; `progress` in 0..=1 is the completed share of all steps.
     ///
     /// # Errors
     /// [`AvatarError::Gpu`], [`AvatarError::Backward`].
@@ -301,7 +303,7 @@ impl Fit {
         self.round.0[at]
     }
 
-    /// Mean PSNR over all images as the avatar is now, decibels of the mean squared error.
+    /// Computes the mean PSNR of the avatar over all images, decibels of the mean squared error.
     ///
     /// # Errors
     /// [`AvatarError::Gpu`].
@@ -313,7 +315,7 @@ impl Fit {
         Ok(-10.0 * (sum / self.views.len().max(1) as f64).max(1e-10).log10())
     }
 
-    /// Rates of all lists and columns.
+    /// Returns the rates of all lists and columns.
     fn rates(&self, progress: f32) -> [Element; 4] {
         let rate = |[from, to]: [f32; 2]| from * (to / from).powf(progress.clamp(0.0, 1.0));
         let FitSettings { offset_rate_m, scale_rate, opacity_rate, rotation_rate, color_rate, .. } = &self.settings;
@@ -351,7 +353,7 @@ impl Fit {
     }
 }
 
-/// Adam's steps do not depend on the size of derivatives, but on that of a few against the others: of the higher coefficients a share counts.
+/// Scales the derivatives of higher coefficients down. Adam's steps depend on the relative size of derivatives alone.
 fn slow_down(slopes: &mut [Element], coefficients: usize) {
     if coefficients == HarmonicOrder::Zero.coefficients() {
         return;

@@ -1,8 +1,8 @@
-//! Error of a drawn image against a photograph of the person, and its derivative.
+//! Error of a rendered image against a photograph of the person, and its derivative.
 //!
-//! Compared are the bytes that a viewer would show: straight colours in sRGB times coverage, against the photograph times its mask
-//! (LoGAvatar Eq. 16, without the learnt perceptual term: distances of colours, structural similarity, and differences of what sharpening
-//! adds, Eq. 17), and coverage against the mask.
+//! The comparison uses the bytes that a viewer would show: straight colours in sRGB times coverage, against the
+//! photograph times its mask (LoGAvatar Eq. 16 without the learned perceptual term: colour distance, structural
+//! similarity, and unsharp-mask differences, Eq. 17), and coverage against the mask.
 
 use flyrig_renderer::srgb_from_linear;
 use rayon::prelude::*;
@@ -11,22 +11,23 @@ use crate::fit::ssim::{Blur, ssim};
 
 /// Coverage below which a pixel has no colour.
 const CLEAR: f32 = 1.0 / 512.0;
-/// Colours below this have the slope of this one: at black the curve of sRGB is too steep to descend.
+/// Linear value below which the slope of the sRGB curve is held constant: at black it is too steep to descend.
 const DARK: f32 = 1e-3;
 
-/// Distances of colours below this have no direction, codes of 0..=1.
+/// Colour distance below which there is no gradient, codes of 0..=1.
 const LEAST: f32 = 1e-4;
 
-/// Weights of the parts of the error.
+/// Weights of the error's terms.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct ErrorWeights {
-    /// Of distances of colours, root mean squares of the three channels.
+    /// Weight of colour distances, root mean squares of the three channels.
     pub color: f32,
-    /// Of one minus the structural similarity.
+    /// Weight of one minus the structural similarity.
     pub structure: f32,
-    /// Of absolute differences of coverage.
+    /// Weight of absolute differences of coverage.
     pub coverage: f32,
-    /// Of absolute differences of the images less their smoothed selves: an unsharp mask, so that fine detail counts more.
+    /// Weight of absolute differences of unsharp masks (an image less its blurred version), which emphasises fine
+    /// detail.
     pub sharpness: f32,
 }
 
@@ -36,14 +37,14 @@ impl Default for ErrorWeights {
     }
 }
 
-/// Error of one image.
+/// Error of one image and its derivative.
 #[derive(Debug, Clone, PartialEq, Default)]
 pub struct ImageDifference {
-    /// The weighted error, a mean over the pixels of the person.
+    /// Weighted error, a mean over the pixels of the person.
     pub loss: f64,
-    /// Mean squared difference of sRGB over all pixels that are compared, codes of 0..=1.
+    /// Mean squared difference of sRGB over all compared pixels, codes of 0..=1.
     pub squared: f64,
-    /// Derivative with respect to premultiplied linear red, green, blue, and coverage; an element a pixel.
+    /// Derivative with respect to premultiplied linear red, green, blue, and coverage; one element per pixel.
     pub slope: Vec<[f32; 4]>,
 }
 
@@ -52,7 +53,7 @@ fn srgb_slope(linear: f32) -> f32 {
     if linear <= 0.003_130_8 { 12.92 } else { 1.055 / 2.4 * linear.powf(1.0 / 2.4 - 1.0) }
 }
 
-/// A drawn pixel as it is compared: sRGB times coverage, and what is needed for its slope.
+/// Rendered pixel in compared form: sRGB times coverage, with its derivatives.
 #[derive(Debug, Clone, Copy, Default)]
 struct Shown {
     color: [f32; 3],
@@ -80,8 +81,8 @@ impl Shown {
     }
 }
 
-/// Returns the sum of absolute differences of two planes, each less its smoothed self (LoGAvatar Eq. 17), and its derivative with respect to
-/// `drawn`.
+/// Returns the sum of absolute differences of two planes' unsharp masks (LoGAvatar Eq. 17), and its derivative with
+/// respect to `drawn`.
 fn sharpness(drawn: &[f32], wanted: &[f32], width: usize) -> (f64, Vec<f32>) {
     let count = drawn.len().min(wanted.len());
     if width == 0 || count < width {
@@ -101,13 +102,13 @@ fn sharpness(drawn: &[f32], wanted: &[f32], width: usize) -> (f64, Vec<f32>) {
 pub struct Photograph<'a> {
     /// sRGB and mask.
     pub rgba: &'a [u8],
-    /// Pixels whose colour is not the person's alone and is not compared; none where the list is shorter.
+    /// Pixels of mixed colour, which is not compared; pixels beyond the end of the list are not mixed.
     pub mixed: &'a [bool],
 }
 
 impl ImageDifference {
-    /// Compares a drawn image (premultiplied linear RGB, coverage) with a photograph of `width` pixels a row. A drawn pixel that is not
-    /// finite counts as clear and has no slope.
+    /// Compares a rendered image (premultiplied linear RGB, coverage) with a photograph of `width` pixels per row. A
+    /// non-finite pixel counts as transparent and has no slope.
     #[must_use]
     pub fn of(drawn: &[[f32; 4]], photograph: Photograph<'_>, width: usize, weights: &ErrorWeights) -> Self {
         let wanted = photograph.rgba;

@@ -1,17 +1,18 @@
-//! Pixels at a person's outline. Their colours are mixed with what is behind the person: learnt, they leave streaks on the avatar along
-//! whatever lay at the outline of a camera of the take. They say where the person ends, and nothing of the colour.
+//! Pixels at a person's outline. Their colours are mixed with the background and would leave streaks on the avatar
+//! along each camera's outline. They are compared by coverage alone.
 
 use rayon::prelude::*;
 
-/// Pixels so near to the outline are mixed.
+/// Distance from the outline within which pixels are mixed, pixels.
 const RIM_PX: usize = 1;
-/// A pixel is marked where one inside is so near.
+/// Largest distance of a marked pixel from an unmarked one inside, pixels.
 const REACH_PX: usize = 3;
-/// Mask from which a pixel shows the person alone.
+/// Least mask value of a pixel that shows the person alone.
 const WHOLE: u8 = 250;
 
-/// Marks the pixels of a person (`rgba`: the mask is the alpha, `width` pixels a row) that lie near the outline and beside pixels farther
-/// inside. What is thinner than the rims of both sides is not marked: its colours would be unknown.
+/// Marks the pixels of a person (`rgba`: the mask is the alpha, `width` pixels a row) that lie near the outline and
+/// beside pixels farther inside. Parts thinner than the rims of both sides are not marked, since their colours would be
+/// unknown.
 pub(crate) fn mixed(rgba: &[u8], width: usize) -> Vec<bool> {
     let height = rgba.len() / 4 / width.max(1);
     let around = |i: usize, reach: usize| {

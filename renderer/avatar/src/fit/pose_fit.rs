@@ -1,8 +1,10 @@
-//! Corrections of a take's poses, learnt with the Gaussians (LoGAvatar, section 4.3: "along with the learnable pose parameters").
+//! Corrections of a take's poses, learned with the Gaussians (LoGAvatar, section 4.3: "along with the learnable pose
+//! parameters").
 //!
-//! Each frame has a small turn of every joint in the joint's own frame, and a shift of the root in the root's: `R exp(turn)`, `t + R_0 shift`. They
-//! serve the fit alone. Two things keep them from taking over what belongs to the avatar: they are pulled to zero and to the frames beside them,
-//! and their mean over the take is zero after every step, as one correction for all frames would be another body at rest.
+//! Each frame has a small rotation of every joint in the joint's own frame, and a shift of the root in the root's: `R
+//! exp(turn)`, `t + R_0 shift`. They serve the fit alone. Two terms keep them from absorbing the avatar's own shape:
+//! they are pulled to zero and to the neighbouring frames, and their mean over the take is zero after every step, since
+//! a correction common to all frames would be another rest pose.
 
 use flyrig_body::Skeleton;
 use flyrig_types::Pose;
@@ -13,33 +15,33 @@ use crate::fit::skinning::BoneSlope;
 /// Rates at the start and at the end: radians of turns, metres of shifts.
 const TURN_RATE_RAD: [f32; 2] = [1.5e-3, 1.5e-4];
 const SHIFT_RATE_M: [f32; 2] = [5e-4, 5e-5];
-/// Corrections at which the pull to zero is as strong as images usually are.
+/// Corrections at which the pull to zero equals the usual derivative of the images.
 const TURN_RAD: f32 = 0.1;
 const SHIFT_M: f32 = 0.02;
-/// Pull to the frames beside, against that to zero.
+/// Pull to the neighbouring frames relative to that to zero.
 const SMOOTH: f32 = 1.0;
 /// Decay of the mean squares of the derivatives.
 const BETA: f32 = 0.99;
-/// Share of the usual derivatives in the denominator: joints that hardly show move little.
+/// Share of the usual derivatives in the denominator: hardly visible joints move little.
 const SHARE: f32 = 0.3;
-/// A step is no longer than so many times the rate.
+/// Largest step, in rates.
 const LARGEST: f32 = 5.0;
-/// Derivatives are smaller than this.
+/// Bound on derivatives.
 const LARGEST_SLOPE: f64 = 1e6;
 
-/// Learns corrections of poses.
+/// Learned corrections of poses.
 #[derive(Debug, Clone)]
 pub(crate) struct PoseFit {
-    /// Numbers of a frame: shift of the root, turns of the joints.
+    /// Numbers per frame: shift of the root, rotation vectors of the joints.
     width: usize,
-    /// Corrections, a row a frame.
+    /// Corrections, one row per frame.
     pub corrections: Vec<f32>,
-    /// Mean squares of the derivatives over all frames, a row.
+    /// Mean squares of the derivatives over all frames, one row.
     pub squares: Vec<f32>,
 }
 
 impl PoseFit {
-    /// No correction, for so many frames and joints.
+    /// Starts without corrections, for this many frames and joints.
     pub fn new(frames: usize, joints: usize) -> Self {
         let width = 3 + 3 * joints;
         Self { width, corrections: vec![0.0; frames * width], squares: vec![0.0; width] }
@@ -62,8 +64,8 @@ impl PoseFit {
         corrected
     }
 
-    /// Descends by one step, the `count`th from 1, along the derivatives of an image of `frame`, whose pose without correction is `pose`;
-    /// `progress` in 0..=1 is the part of all steps that is done.
+    /// Descends by one step, the `count`th from 1, along the derivatives of an image of `frame`, whose pose without
+    /// correction is `pose`; `progress` in 0..=1 is the completed share of all steps.
     pub fn descend(
         &mut self,
         frame: usize,
@@ -98,7 +100,7 @@ impl PoseFit {
         self.center();
     }
 
-    /// Returns the mean corrections of the frames beside one, its own where there are none.
+    /// Returns the mean corrections of the neighbouring frames, the frame's own where there are none.
     fn around(&self, frame: usize, frames: usize) -> Vec<f32> {
         let beside = [frame.checked_sub(1), Some(frame + 1).filter(|next| *next < frames)];
         let rows: Vec<&[f32]> = beside.into_iter().flatten().map(|other| self.row(other)).collect();
@@ -109,7 +111,7 @@ impl PoseFit {
         }
     }
 
-    /// Takes the mean over all frames away.
+    /// Subtracts the mean over all frames.
     fn center(&mut self) {
         let frames = (self.corrections.len() / self.width).max(1);
         let mut mean = vec![0.0f64; self.width];
@@ -121,7 +123,7 @@ impl PoseFit {
         }
     }
 
-    /// Returns dL/d corrections of a frame from dL/d motions of the bones. One that is not finite counts as zero.
+    /// Returns dL/d corrections of a frame from dL/d motions of the bones. Non-finite ones count as zero.
     fn slopes(&self, frame: usize, skeleton: &Skeleton, pose: &Pose, bones: &[BoneSlope]) -> Vec<f32> {
         let joints = skeleton.joints();
         // A joint moves itself and all that hang on it, parents come first.
@@ -150,7 +152,7 @@ impl PoseFit {
     }
 }
 
-/// Mean square over the numbers that ever had a derivative.
+/// Returns the mean square over the numbers that ever had a derivative.
 fn usual(squares: &[f32]) -> f32 {
     let (sum, count) =
         squares.iter().filter(|v| **v > 0.0).fold((0.0f64, 0u32), |(sum, n), v| (sum + f64::from(*v), n + 1));
@@ -185,7 +187,7 @@ mod tests {
     use crate::model::parameters::Element;
     use crate::model::posing::{Bones, PosedAvatar};
 
-    /// Corrections at random of three frames.
+    /// Returns random corrections of three frames.
     fn random_fit(avatar: &Avatar) -> PoseFit {
         let mut random = StdRng::seed_from_u64(7);
         let mut fit = PoseFit::new(3, avatar.template.skeleton.joints().len());
@@ -276,7 +278,7 @@ mod tests {
         }
     }
 
-    /// The pull alone: frames differ less from those beside them, and all of them come back to zero.
+    /// Checks the pull alone: neighbouring frames become more alike and all corrections return to zero.
     #[test]
     fn without_images_corrections_vanish() {
         let avatar = small(40, 7);

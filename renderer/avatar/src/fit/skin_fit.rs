@@ -1,8 +1,8 @@
-//! Corrections of the skin weights, learnt with the Gaussians (LoGAvatar Eq. 15).
+//! Corrections of the skin weights, learned with the Gaussians (LoGAvatar Eq. 15).
 //!
-//! The paper adds a number to each weight. Here a Gaussian's weights are multiplied by `exp(number)` and brought to the sum 1, so that they stay
-//! above zero, and bones that do not move the Gaussian in the template do not move it afterwards. The corrected weights are the avatar's own after
-//! every step: a file holds nothing else.
+//! The paper adds a number to each weight. Here a Gaussian's weights are multiplied by `exp(number)` and normalised to
+//! the sum 1, so that they stay above zero, and bones that do not move the Gaussian in the template do not move it
+//! afterwards. The corrected weights are written to the avatar after every step: a file holds nothing else.
 
 use flyrig_body::SkinWeights;
 use rayon::prelude::*;
@@ -13,29 +13,31 @@ use crate::model::parameters::Element;
 
 /// Rates at the start and at the end.
 const RATE: [f32; 2] = [2e-2, 2e-3];
-/// Numbers at which the pull to the template is as strong as images usually are, and difference to the neighbours of the same pull.
+/// Numbers at which the pull to the template equals the usual derivative of the images, and difference to the
+/// neighbours with the same pull.
 const TEMPLATE: f32 = 1.0;
 const AROUND: f32 = 0.1;
-/// Weights are not multiplied by more than `exp(4)`, nor by less than `exp(-4)`.
+/// Bound on the logarithm of a factor: factors lie between `exp(-4)` and `exp(4)`.
 const MOST: f32 = 4.0;
 
-/// Learns skin weights.
+/// Learned corrections of skin weights.
 #[derive(Debug)]
 pub(crate) struct SkinFit {
     template: Vec<SkinWeights>,
-    /// Logarithms of the factors, by Gaussian and place in its list of weights.
+    /// Logarithms of the factors, per Gaussian and entry of its list of weights.
     pub factors: Vec<Element>,
     pub adam: Adam,
 }
 
 impl SkinFit {
-    /// Starts with the weights as they are.
+    /// Starts without corrections.
     pub fn new(template: &[SkinWeights]) -> Self {
         let factors = vec![[0.0; 4]; template.len()];
         Self { template: template.to_vec(), adam: Adam::new(factors.len()), factors }
     }
 
-    /// Descends by one step, the `count`th from 1, along dL/d factors; `progress` in 0..=1 is the part of all steps that is done.
+    /// Descends by one step, the `count`th from 1, along dL/d factors; `progress` in 0..=1 is the completed share of
+    /// all steps.
     pub fn descend(&mut self, slopes: &mut [Element], neighbors: &Neighbors, count: u64, progress: f32) {
         let usual = self.adam.usual().map(f32::sqrt);
         slopes.par_iter_mut().enumerate().with_min_len(1024).for_each(|(i, slope)| {
@@ -68,7 +70,7 @@ impl SkinFit {
         if count > 0.0 { sum / count } else { self.factors[i][slot] }
     }
 
-    /// Writes the corrected weights: none below zero, sum 1 where a bone moves the Gaussian.
+    /// Writes the corrected weights: non-negative, with the sum 1 where a bone moves the Gaussian.
     pub fn bake(&self, skin: &mut [SkinWeights]) {
         for ((skin, template), factors) in skin.iter_mut().zip(&self.template).zip(&self.factors) {
             let weights: Element = std::array::from_fn(|k| template.weights[k].max(0.0) * factors[k].exp());

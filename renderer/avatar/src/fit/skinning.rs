@@ -1,8 +1,8 @@
 //! Derivatives of linear blend skinning (FlyHuman Eq. 1 and 2) with respect to the motion of the bones.
 //!
-//! A place `c` is the weighted mean of the places `p` to which its bones bring it. A bone that turns by a small world vector `w` around the
-//! world's origin moves its `p` by `w x p`, and its quaternion `q` by `(w, 0) q / 2`. So it is enough to sum a force and a torque for each bone,
-//! whatever joints turn it.
+//! A position `c` is the weighted mean of the positions `p` given by its bones. A bone that rotates by a small world
+//! vector `w` around the world's origin moves its `p` by `w x p`, and its quaternion `q` by `(w, 0) q / 2`. Summing a
+//! force and a torque for each bone is therefore enough, regardless of the joints that move it.
 
 use glam::{DQuat, DVec3, DVec4, Quat, Vec3, Vec4};
 use rayon::prelude::*;
@@ -11,15 +11,15 @@ use crate::model::avatar::Avatar;
 use crate::model::parameters::Element;
 use crate::model::posing::{Bones, PosedAvatar};
 
-/// Gaussians that one thread sums up at once.
+/// Gaussians per task.
 const CHUNK: usize = 4096;
 
 /// Derivatives with respect to small motions of one bone in the world.
 #[derive(Debug, Clone, Copy, PartialEq, Default)]
 pub(crate) struct BoneSlope {
-    /// By a shift, per metre.
+    /// Derivative by a shift, per metre.
     pub shift: DVec3,
-    /// By a turn around the world's origin, per radian.
+    /// Derivative by a rotation around the world's origin, per radian.
     pub turn: DVec3,
 }
 
@@ -32,16 +32,16 @@ impl std::ops::AddAssign for BoneSlope {
 
 /// Derivatives of one Gaussian.
 struct Slopes {
-    /// By its world place.
+    /// Derivative by the world position.
     center: DVec3,
-    /// By the blended quaternion before it is normalised.
+    /// Derivative by the blended quaternion before normalisation.
     blend: DVec4,
     /// Sum of the weights.
     sum: f64,
 }
 
 impl Slopes {
-    /// None for a Gaussian that no bone moves.
+    /// Computes the derivatives; `None` for a Gaussian that no bone moves.
     fn new(bones: &Bones, avatar: &Avatar, i: usize, center: Element, rotation: Element) -> Option<Self> {
         let (mut blended, mut sum) = (Vec4::ZERO, 0.0f32);
         for bone in bones.influences(&avatar.skin[i]) {
@@ -62,8 +62,9 @@ impl Slopes {
 }
 
 impl Avatar {
-    /// Returns dL/d motion of each bone (world) from dL/d world places and quaternions of the Gaussians, before
-    /// [`PosedAvatar::to_parameters`] has changed these. What is not finite is left out. Light does not count: poses are not to explain shades.
+    /// Returns dL/d motion of each bone (world) from dL/d world positions and quaternions of the Gaussians, before
+    /// [`PosedAvatar::to_parameters`] has changed these. Non-finite values are dropped. Light is ignored: poses must
+    /// not explain shading.
     pub(crate) fn bone_slopes(
         &self,
         bones: &Bones,
@@ -104,8 +105,8 @@ impl Avatar {
         all
     }
 
-    /// Returns dL/d logarithms of the skin weights, for weights that keep the sum 1, from dL/d world places and quaternions of the Gaussians; see
-    /// [`Self::bone_slopes`]. Gaussians that one bone moves have none.
+    /// Returns dL/d logarithms of the skin weights under the constraint of the sum 1, from dL/d world positions and
+    /// quaternions of the Gaussians; see [`Self::bone_slopes`]. They are zero for Gaussians with a single bone.
     pub(crate) fn weight_slopes(
         &self,
         bones: &Bones,
@@ -135,7 +136,7 @@ impl Avatar {
     }
 }
 
-/// Skinning as the formulas say it, in f64.
+/// Reference of skinning by its formulas, in f64.
 #[cfg(test)]
 pub(crate) mod reference {
     use flyrig_body::SkinWeights;
@@ -144,7 +145,8 @@ pub(crate) mod reference {
 
     use super::*;
 
-    /// A loss that weighs every number of the world places and quaternions of the Gaussians from `first` on.
+    /// Computes a loss that weights every number of the world positions and quaternions of the Gaussians from `first`
+    /// on.
     pub(crate) fn loss(
         avatar: &Avatar,
         skin: &[SkinWeights],

@@ -1,6 +1,7 @@
 //! Structural similarity of a plane, and its derivative.
 //!
-//! Wang et al. 2004 with a Gaussian window of 11 pixels (standard deviation 1.5); outside of the plane both images are black.
+//! Wang et al. 2004 with a Gaussian window of 11 pixels (standard deviation 1.5); outside of the plane both images are
+//! zero.
 
 use rayon::prelude::*;
 
@@ -15,7 +16,7 @@ fn window() -> [f32; RADIUS + 1] {
     half.map(|value| (value / sum) as f32)
 }
 
-/// Smooths planes of one size.
+/// Gaussian blur of planes of one size.
 #[derive(Debug)]
 pub(crate) struct Blur {
     window: [f32; RADIUS + 1],
@@ -23,12 +24,12 @@ pub(crate) struct Blur {
 }
 
 impl Blur {
-    /// For planes with rows of `width` pixels.
+    /// Prepares the blur of planes with rows of `width` pixels.
     pub(crate) fn new(width: usize) -> Self {
         Self { window: window(), width }
     }
 
-    /// Convolves a plane with the window, which is its own transpose. The plane has whole rows, and more than none.
+    /// Convolves a plane with the window, which is its own transpose. The plane has complete rows, at least one.
     pub(crate) fn apply(&self, plane: &[f32]) -> Vec<f32> {
         let (width, window) = (self.width, &self.window);
         let height = plane.len() / width.max(1);
@@ -54,8 +55,8 @@ impl Blur {
     }
 }
 
-/// Returns the sum of the similarity over all pixels of a plane, values 0..=1, and its derivative with respect to `drawn`. Both planes have
-/// whole rows of `width` pixels; without a pixel the sum is 0.
+/// Returns the sum of the similarity over all pixels of a plane, values 0..=1, and its derivative with respect to
+/// `drawn`. Both planes have complete rows of `width` pixels; without a pixel the sum is 0.
 pub(crate) fn ssim(drawn: &[f32], wanted: &[f32], width: usize) -> (f64, Vec<f32>) {
     let count = drawn.len().min(wanted.len());
     if width == 0 || count < width {
@@ -90,7 +91,7 @@ mod tests {
 
     use super::*;
 
-    /// The definition, pixel by pixel in f64.
+    /// Reference by the definition, pixel by pixel in f64.
     fn reference(drawn: &[f64], wanted: &[f64], width: usize) -> f64 {
         let height = drawn.len() / width;
         let weight = |d: i64| (-0.5 * (d as f64 / DEVIATION).powi(2)).exp();

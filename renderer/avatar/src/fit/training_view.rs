@@ -1,29 +1,29 @@
-//! Images of a take, cut to the person.
+//! Images of a take, cropped to the person.
 
 use flyrig_types::Camera;
 
 use crate::fit::image_error::Photograph;
 use crate::fit::outline::mixed;
 
-/// Images are cut to the person and so many pixels around.
+/// Margin around the person, pixels.
 const MARGIN_PX: u32 = 12;
-/// Cut images have sides of so many pixels, or a multiple: buffers are made for each size.
+/// Divisor of the sides of crops, pixels: buffers are allocated for each size, so few sizes are wanted.
 const SIDE_PX: u32 = 64;
 
-/// An image of the person, cut to it.
+/// Image cropped to the person.
 #[derive(Debug, Clone)]
 pub struct TrainingView {
     pub(crate) frame: usize,
     pub(crate) camera: Camera,
     /// sRGB and mask.
     rgba: Vec<u8>,
-    /// Pixels whose colour is not the person's alone.
+    /// Pixels whose colour is mixed with the background.
     mixed: Vec<bool>,
 }
 
 impl TrainingView {
-    /// Cuts an image, sRGB with the mask as alpha, to the person. None where nobody is in it, or its bytes are not those of the camera's
-    /// size.
+    /// Crops an image, sRGB with the mask as alpha, to the person. `None` without a person, or for bytes that do not
+    /// match the camera's size.
     #[must_use]
     pub fn cut(frame: usize, camera: &Camera, rgba: &[u8]) -> Option<Self> {
         let (width, height) = (camera.intrinsics.width, camera.intrinsics.height);
@@ -60,7 +60,7 @@ impl TrainingView {
         Some(Self { frame, camera, rgba: cut, mixed })
     }
 
-    /// Width and height, pixels.
+    /// Returns width and height, pixels.
     pub(crate) fn size(&self) -> [u32; 2] {
         [self.camera.intrinsics.width, self.camera.intrinsics.height]
     }

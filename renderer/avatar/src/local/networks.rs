@@ -1,13 +1,13 @@
-//! LoGAvatar's local networks: the lists of an avatar's Gaussians as outputs of networks that neighbours share.
+//! Prediction of an avatar's lists by LoGAvatar's local networks.
 //!
-//! Geometry: anchors spread over the surface, a group of Gaussians around each with displacements of their own (Eq. 11), and a hash
-//! encoding whose features three decoders turn into scales, rotations and opacities (Eq. 12). Further stages take the Gaussians of the stage
-//! before as their anchors and predict offsets too (Eq. 13). Texture: a neural texture, a convolutional encoder, and an atlas of spherical
-//! harmonics, in which each Gaussian looks its colour up (Eq. 14).
+//! Geometry: anchors spread over the surface, a group of Gaussians around each with free displacements (Eq. 11), and a
+//! hash encoding whose features three decoders map to scales, rotations and opacities (Eq. 12). Further stages use the
+//! Gaussians of the previous stage as anchors and predict offsets too (Eq. 13). Texture: a neural texture, a
+//! convolutional encoder, and an atlas of spherical harmonics that is sampled for each Gaussian (Eq. 14).
 //!
-//! Networks predict what is added to the start, and start at zero: the first picture is that of the avatar as it was made. They are
-//! evaluated in every step into the avatar's lists, so that at the end nothing else is needed. Encoding, groups and query are linear: their
-//! derivatives are carried back by hand, those of the layers by burn.
+//! Networks predict residuals that start at zero, so that the first image is that of the initial avatar. Every step
+//! writes their outputs to the avatar's lists, so that the result needs no network. Encoding, groups and sampling are
+//! linear: their derivatives are computed by hand, those of the layers by burn.
 
 use std::collections::BTreeMap;
 
@@ -28,41 +28,41 @@ use crate::error::AvatarError;
 use crate::model::avatar::Avatar;
 use crate::model::parameters::{Element, GaussianParameters};
 
-/// Exponential means of Adam.
+/// Decay rates of Adam's moments.
 const BETAS: [f32; 2] = [0.9, 0.99];
-/// Share of the usual derivatives in Adam's denominator, for numbers that belong to one place: see the direct fit's Adam.
+/// Share of the usual derivatives in Adam's denominator, for parameters of one position: see the direct fit's Adam.
 const SHARE: f32 = 0.3;
-/// Steps after which later stages look anew where the Gaussians before them are.
+/// Steps between updates of the later stages' input positions.
 const REFRESH: u64 = 200;
-/// Derivatives are smaller than this.
+/// Bound on derivatives.
 const LARGEST: f32 = 1e6;
 /// Spread of the hash tables at the start.
 const TABLE_SPREAD: f32 = 0.1;
 
-/// Settings of the local networks. Rates are at the start and at the end.
+/// Settings of the local networks. Rates are given at the start and at the end.
 #[derive(Debug, Clone, PartialEq)]
 pub struct LocalSettings {
-    /// Whether networks predict places, scales, rotations and opacities; otherwise each Gaussian's are learnt by themselves.
+    /// Whether networks predict positions, scales, rotations and opacities; otherwise these are learned directly.
     pub geometry: bool,
-    /// Whether colours are looked up in an atlas; otherwise each Gaussian's are learnt by themselves.
+    /// Whether colours are sampled from an atlas; otherwise they are learned directly.
     pub colors: bool,
-    /// Gaussians around an anchor, in the mean.
+    /// Mean number of Gaussians around an anchor.
     pub group: usize,
-    /// Stages; all have about the same number of Gaussians.
+    /// Number of stages; all have about the same number of Gaussians.
     pub stages: usize,
-    /// How the surface lies in the atlas.
+    /// Layout of the surface in the atlas.
     pub layout: AtlasLayout,
     /// Texels along a side of a chart.
     pub side: usize,
     /// Rate of displacements, metres.
     pub displacement_rate_m: [f32; 2],
-    /// Of hash tables.
+    /// Rate of hash tables.
     pub table_rate: [f32; 2],
-    /// Of decoders.
+    /// Rate of decoders.
     pub decoder_rate: [f32; 2],
-    /// Of the neural texture.
+    /// Rate of the neural texture.
     pub texture_rate: [f32; 2],
-    /// Of its encoder.
+    /// Rate of the texture's encoder.
     pub encoder_rate: [f32; 2],
 }
 
@@ -84,22 +84,22 @@ impl Default for LocalSettings {
     }
 }
 
-/// A stage of the geometry.
+/// Stage of the geometry.
 #[derive(Debug)]
 struct Stage {
     groups: Groups,
-    /// Places that are encoded: Gaussians of the stage before, as indices.
+    /// Encoded positions: indices of Gaussians of the previous stage.
     inputs: Vec<u32>,
-    /// Where they were when they were encoded last.
+    /// Their positions at the last encoding.
     encoded: Vec<[f32; 3]>,
     encoding: HashEncoding,
 }
 
-/// Results of an evaluation that its derivatives need.
+/// Intermediate results of an evaluation for its derivatives.
 #[derive(Debug)]
 struct Tape {
     tensors: Tensors,
-    /// For each stage: features, outputs of all branches.
+    /// Features and outputs of all branches, per stage.
     stages: Vec<(Tensor<2>, Vec<Tensor<2>>)>,
     atlas: Option<Tensor<4>>,
 }
@@ -109,16 +109,16 @@ struct Tape {
 pub(crate) struct Local {
     settings: LocalSettings,
     device: Device,
-    /// Lists of the avatar as it was made, without colours, and places of its Gaussians.
+    /// Lists of the initial avatar, without colours, and positions of its Gaussians.
     start: GaussianParameters,
     places: Vec<Vec3>,
     around: Box3,
     stages: Vec<Stage>,
-    /// The atlas, and what it starts as; None where colours are learnt by themselves.
+    /// Atlas and its initial value; `None` where colours are learned directly.
     atlas: Option<(AtlasMap, Vec<f32>)>,
-    /// Numbers that go through burn.
+    /// Parameters that burn differentiates.
     networks: BTreeMap<String, Parameter>,
-    /// Displacements and hash tables.
+    /// Parameters that are differentiated by hand: displacements and hash tables.
     tables: BTreeMap<String, Parameter>,
     moments: BTreeMap<String, Moments>,
     tape: Option<Tape>,
@@ -126,7 +126,8 @@ pub(crate) struct Local {
 }
 
 impl Local {
-    /// Networks for an avatar as it was made; `uvs` are the texture coordinates of its Gaussians, empty without any.
+    /// Creates the networks for an initial avatar; `uvs` are the texture coordinates of its Gaussians, empty without
+    /// any.
     pub fn new(avatar: &Avatar, uvs: &[Vec2], settings: &LocalSettings, seed: u64) -> Result<Self, AvatarError> {
         let places = avatar.places.clone();
         let (count, order) = (places.len(), avatar.parameters.order());
@@ -185,17 +186,17 @@ impl Local {
         })
     }
 
-    /// Numbers that are learnt.
+    /// Returns the number of learned parameters.
     pub fn numbers(&self) -> usize {
         flyrig_learn::count(&self.networks) + flyrig_learn::count(&self.tables)
     }
 
-    /// Whether a list of [`GaussianParameters::lists`] is predicted. Others are learnt by themselves.
+    /// Returns whether a list of [`GaussianParameters::lists`] is predicted. Others are learned directly.
     pub fn predicts(&self, list: usize) -> bool {
         if list == 3 { self.settings.colors } else { self.settings.geometry }
     }
 
-    /// Writes what the networks say into an avatar's lists. Lists that they do not predict stay as they are.
+    /// Writes the networks' outputs to an avatar's lists. Lists that they do not predict are unchanged.
     pub fn evaluate(&mut self, into: &mut GaussianParameters) {
         let tensors = Tensors::new(&self.networks, &self.device, true);
         let mut lists = self.start.clone();
@@ -261,7 +262,7 @@ impl Local {
         }
     }
 
-    /// Looks anew where the inputs of later stages are, now and then.
+    /// Updates the input positions of later stages every few steps.
     pub fn refresh(&mut self, now: &GaussianParameters) {
         if !self.step.is_multiple_of(REFRESH) {
             return;
@@ -283,7 +284,7 @@ impl Local {
         }
     }
 
-    /// All numbers that change from step to step, by name.
+    /// Returns all numbers that change from step to step, by name.
     pub fn state(&mut self) -> Vec<(String, &mut [f32])> {
         let mut all = Vec::new();
         for (name, parameter) in self.networks.iter_mut().chain(&mut self.tables) {
@@ -300,14 +301,14 @@ impl Local {
         all
     }
 
-    /// Goes on after [`Self::state`] was overwritten by that of a fit that had done so many steps.
+    /// Resumes after [`Self::state`] was overwritten by that of a fit with `step` completed steps.
     pub fn resume(&mut self, step: u64, into: &mut GaussianParameters) {
         self.step = step;
         self.encode_places();
         self.evaluate(into);
     }
 
-    /// Derivatives with respect to all numbers from those with respect to the lists.
+    /// Returns the derivatives with respect to all parameters from those with respect to the lists.
     fn gradients(&mut self, slopes: &[Vec<Element>; 4]) -> BTreeMap<String, Vec<f32>> {
         let mut gradients = BTreeMap::new();
         let Some(Tape { tensors, stages, atlas }) = self.tape.take() else { return gradients };
@@ -347,7 +348,8 @@ impl Local {
         gradients
     }
 
-    /// Colours of higher orders come later: the first third of the steps learns order 0 alone, if there are three.
+    /// Drops the derivatives of colours of higher orders at first: of three orders, the first third of the steps learns
+    /// order 0 alone.
     fn hide_orders(&self, slopes: &mut [Element], progress: f32) {
         let order = self.start.order();
         let orders = order.coefficients().isqrt();
@@ -372,12 +374,12 @@ impl Local {
     }
 }
 
-/// Whether numbers belong to places, so that few of them show in an image.
+/// Returns whether parameters belong to positions, so that few of them influence an image.
 fn is_local(name: &str) -> bool {
     name == "displacement" || name == "texture" || name.ends_with("hash")
 }
 
-/// List and first column that a branch writes, and the size of one unit.
+/// Returns the list and first column that a branch writes, and the size of one unit.
 fn column(branch: &str) -> (usize, usize, f32) {
     match branch {
         "offset" => (0, 0, OFFSET_M),
@@ -387,7 +389,7 @@ fn column(branch: &str) -> (usize, usize, f32) {
     }
 }
 
-/// The places of these.
+/// Returns the positions of these Gaussians.
 fn of(places: &[Vec3], indices: &[u32]) -> Vec<Vec3> {
     indices.iter().map(|i| places[*i as usize]).collect()
 }
@@ -396,7 +398,8 @@ fn table_of(values: Vec<f32>, rows: usize, columns: usize, device: &Device) -> T
     Tensor::from_data(TensorData::new(values, [rows, columns]), device)
 }
 
-/// Derivatives with those that no image gives as zero, NaN among them: through the networks one would spoil all Gaussians.
+/// Replaces non-finite derivatives with zero and bounds the others: through the networks, a single one would spoil all
+/// Gaussians.
 fn finite(list: &[Element]) -> Vec<Element> {
     list.iter().map(|row| row.map(|slope| if slope.abs() < LARGEST { slope } else { 0.0 })).collect()
 }

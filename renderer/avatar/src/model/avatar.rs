@@ -1,4 +1,4 @@
-//! An avatar: body, Gaussians, and their provenance.
+//! Avatar: body, Gaussians, and their provenance.
 
 use flyrig_body::{DeformationGraph, SkinWeights, SurfaceGaussians, Template};
 use flyrig_renderer::{HarmonicOrder, SH_DEGREE_0};
@@ -11,9 +11,9 @@ use crate::model::known_poses::KnownPoses;
 use crate::model::light::Light;
 use crate::model::parameters::GaussianParameters;
 
-/// Thickness of a Gaussian across the surface at the start, against its size along it.
+/// Initial thickness of a Gaussian across the surface, relative to its size along it.
 const THICKNESS: f32 = 0.5;
-/// Opacity at the start.
+/// Initial opacity.
 const OPACITY: f32 = 0.99;
 
 /// Provenance of an avatar: its take and how it was fitted. Stored in the file.
@@ -21,51 +21,52 @@ const OPACITY: f32 = 0.99;
 pub struct Card {
     /// Name of the person or take.
     pub name: String,
-    /// How it was learnt.
+    /// Method of the fit.
     pub method: String,
-    /// Cameras whose images were looked at.
+    /// Cameras whose images were used.
     pub cameras: Vec<String>,
-    /// First frame, and the one after the last.
+    /// Range of frames, end excluded.
     pub frames: [u64; 2],
-    /// Whether poses and masks were given or estimated.
+    /// Origin of the poses: given or estimated.
     pub pose: String,
-    /// The same of masks.
+    /// Origin of the masks: given or estimated.
     pub masks: String,
-    /// Steps of gradient descent, and the seed of their order.
+    /// Steps of gradient descent.
     pub steps: u64,
-    /// Seed.
+    /// Seed of the order of images.
     pub seed: u64,
-    /// Mean error of the training images at the end, decibels.
+    /// Mean PSNR of the training images at the end, decibels.
     pub training_db: f64,
-    /// Later changes of texture and shape, in order.
+    /// Later edits of texture and shape, in order.
     #[serde(default, skip_serializing_if = "Vec::is_empty")]
     pub edits: Vec<String>,
 }
 
-/// Gaussians on a deformation graph.
+/// Attachment of the Gaussians to a deformation graph.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Hanging {
-    /// Canonical places of the nodes, metres.
+    /// Canonical positions of the nodes, metres.
     pub nodes: Vec<Vec3>,
     /// Nodes of each Gaussian.
     pub gaussian_nodes: Vec<[u32; 4]>,
-    /// Their weights.
+    /// Weights of these nodes.
     pub gaussian_weights: Vec<[f32; 4]>,
-    /// Mean translation of each node over the take, canonical metres: the shape of hair and clothes where a pose alone drives the avatar.
+    /// Mean translation of each node over the take, canonical metres: the shape of hair and clothes where the avatar is
+    /// driven by a pose alone.
     pub mean: Vec<DVec3>,
 }
 
-/// Where a Gaussian hangs on the template's surface.
+/// Attachment of a Gaussian to the template's surface.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Attachment {
-    /// Triangle of the template.
+    /// Index of the template's triangle.
     pub triangle: u32,
     /// Weights of the triangle's corners, sum 1.
     pub barycentric: [f32; 3],
 }
 
 impl Attachment {
-    /// Blends values of the template's vertices.
+    /// Interpolates values of the template's vertices.
     pub(crate) fn blend(&self, template: &Template, values: &[Vec3]) -> Vec3 {
         template.triangles[self.triangle as usize]
             .iter()
@@ -75,20 +76,20 @@ impl Attachment {
     }
 }
 
-/// A personal avatar. All lists of Gaussians have the same length.
+/// Personal avatar. All lists of Gaussians have the same length.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Avatar {
     /// Body, clothes included.
     pub template: Template,
-    /// Canonical places of the Gaussians on the body, metres.
+    /// Canonical positions of the Gaussians on the body, metres.
     pub places: Vec<Vec3>,
-    /// Where they hang on the body's surface; those that are inset lie below it.
+    /// Attachment to the body's surface; inset Gaussians lie below it.
     pub attachments: Vec<Attachment>,
-    /// Bones that move each Gaussian.
+    /// Skin weights of each Gaussian.
     pub skin: Vec<SkinWeights>,
-    /// Deformation graph; None without one.
+    /// Attachment to a deformation graph; `None` without one.
     pub hanging: Option<Hanging>,
-    /// Poses of the take.
+    /// Poses seen in the take.
     pub known_poses: KnownPoses,
     /// Fitted attributes of the Gaussians.
     pub parameters: GaussianParameters,
@@ -99,11 +100,11 @@ pub struct Avatar {
 }
 
 impl Avatar {
-    /// An avatar that looks as the person is drawn live: `surface` are the Gaussians of `template`, `graph` deforms them, `colors` are
-    /// linear RGB, one value per Gaussian (grey where missing).
+    /// Creates an avatar with the look of the live reconstruction: `surface` has the Gaussians of `template`, `graph`
+    /// deforms them, `colors` are linear RGB, one value per Gaussian (grey where missing).
     ///
     /// # Errors
-    /// [`AvatarError::Body`] for a template or lists that do not belong together.
+    /// [`AvatarError::Body`] where template and lists do not belong together.
     pub fn new(
         template: &Template,
         surface: &SurfaceGaussians,
@@ -147,13 +148,13 @@ impl Avatar {
         })
     }
 
-    /// Number of Gaussians.
+    /// Returns the number of Gaussians.
     #[must_use]
     pub fn gaussians(&self) -> usize {
         self.places.len()
     }
 
-    /// Returns the unit normal of the body's surface where each Gaussian hangs, canonical.
+    /// Returns the canonical unit normal of the body's surface at each Gaussian.
     #[must_use]
     pub fn normals(&self) -> Vec<Vec3> {
         let normals = &self.template.normals;
@@ -163,13 +164,13 @@ impl Avatar {
             .collect()
     }
 
-    /// Returns the share of the Gaussians that are in a pose unlike those of the take, see [`KnownPoses::far_share`].
+    /// Returns the share of the Gaussians in a pose unlike those of the take, see [`KnownPoses::far_share`].
     #[must_use]
     pub fn far_share(&self, pose: &Pose) -> f64 {
         self.known_poses.far_share(&self.template.skeleton, &self.skin, pose)
     }
 
-    /// Sets the shape for poses alone to the mean of these translations of the nodes, one list a frame.
+    /// Sets the mean shape to the mean of these node translations, one list per frame.
     pub fn set_mean<'a>(&mut self, frames: impl IntoIterator<Item = &'a [DVec3]>) {
         let Some(hanging) = &mut self.hanging else { return };
         let (mut sum, mut count) = (vec![DVec3::ZERO; hanging.nodes.len()], 0);
@@ -223,7 +224,7 @@ pub(crate) mod tests {
 
     use super::*;
 
-    /// An avatar of the built-in body, with attributes at random.
+    /// Creates an avatar of the built-in body with random attributes.
     pub(crate) fn small(gaussians: usize, nodes: usize) -> Avatar {
         let template = default_template(&ShapeParams::default()).unwrap();
         let surface = sample_surface(&template, gaussians, 5).unwrap();

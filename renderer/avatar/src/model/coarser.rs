@@ -1,4 +1,4 @@
-//! Fewer Gaussians for small images: neighbours merged into one of their mean, extent and colour.
+//! Coarser avatars for small images: pairs of neighbours merged into one Gaussian of their mean, extent and colour.
 
 use flyrig_body::SkinWeights;
 use glam::{Mat3, Quat, Vec3};
@@ -9,17 +9,17 @@ use crate::model::avatar::Avatar;
 use crate::model::neighbors::Neighbors;
 use crate::model::parameters::{Element, GaussianParameters};
 
-/// Cosine between two normals from which surfaces count as one: the sides of a sleeve stay apart.
+/// Least cosine between two normals of one surface: the sides of a sleeve stay apart.
 const SAME_SIDE: f32 = 0.5;
-/// Share of the weights that the same bones must have: two fingers stay apart.
+/// Least share of skin weights in common: two fingers stay apart.
 const SAME_BONES: f32 = 0.5;
 /// Least variance along an axis, square metres: no merged Gaussian is thinner than 0.1 mm.
 const LEAST_VARIANCE: f64 = 1e-8;
 
 impl Avatar {
-    /// Returns the avatar with about half as many Gaussians, for images whose pixels are as large as their distances: each is merged with
-    /// the nearest free neighbour on the same side of the surface. The pair's mean, covariance, opacity and colours are kept, weighted
-    /// by opacity times area; the pair moves as its heavier Gaussian does.
+    /// Returns the avatar with about half as many Gaussians, for images whose pixels are as large as their distances:
+    /// each is merged with the nearest free neighbour on the same side of the surface. Mean, covariance, opacity and
+    /// colours of the pair are preserved, weighted by opacity times area; the pair moves with its heavier Gaussian.
     #[must_use]
     pub fn coarser(&self) -> Self {
         let pairs = self.pairs();
@@ -53,7 +53,7 @@ impl Avatar {
         }
     }
 
-    /// The heavier and the lighter Gaussian of each pair; the same one twice where no neighbour was free.
+    /// Returns the heavier and the lighter Gaussian of each pair; the same one twice where no neighbour was free.
     fn pairs(&self) -> Vec<[usize; 2]> {
         let count = self.gaussians();
         let normals = self.normals();
@@ -132,7 +132,7 @@ impl Avatar {
         }
     }
 
-    /// Canonical covariance, square metres.
+    /// Returns the canonical covariance, square metres.
     fn covariance(&self, i: usize) -> Matrix3<f64> {
         let [x, y, z, _] = self.parameters.shape[i];
         let axes = Mat3::from_quat(Quat::from_array(self.parameters.rotation[i]).normalize()).as_dmat3();
@@ -142,7 +142,7 @@ impl Avatar {
     }
 }
 
-/// Attributes of two Gaussians as one.
+/// Merges the attributes of two Gaussians.
 struct Merged {
     offset: Element,
     shape: Element,
@@ -150,7 +150,7 @@ struct Merged {
     harmonics: Vec<Element>,
 }
 
-/// The weight that the same bones have in both.
+/// Returns the skin weight that two Gaussians have in common.
 fn shared_weight(a: &SkinWeights, b: &SkinWeights) -> f32 {
     let in_b = |joint: u16| {
         b.joints.iter().zip(b.weights).filter(|(other, _)| **other == joint).map(|(_, weight)| weight).sum::<f32>()
@@ -170,7 +170,7 @@ mod tests {
     use super::*;
     use crate::model::avatar::tests::small;
 
-    /// Moments of all Gaussians that hang on bodies at rest: weight, mean, second moments, mean colour.
+    /// Computes the moments of all Gaussians in the rest pose: weight, mean, second moments, mean colour.
     fn moments(avatar: &Avatar) -> (f64, glam::DVec3, DMat3, glam::DVec3) {
         let (mut sum, mut mean, mut second, mut color) = (0.0, glam::DVec3::ZERO, DMat3::ZERO, glam::DVec3::ZERO);
         for i in 0..avatar.gaussians() {

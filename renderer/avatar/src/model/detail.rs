@@ -1,4 +1,4 @@
-//! Drawing with no more Gaussians than a camera's pixels resolve.
+//! Rendering with no more Gaussians than a camera's pixels resolve.
 
 use flyrig_body::Part;
 use flyrig_gpu::{GpuContext, GpuError};
@@ -9,24 +9,24 @@ use crate::model::avatar::Avatar;
 use crate::model::posing::Bones;
 use crate::model::scene::AvatarScene;
 
-/// Distance between Gaussians that are not worth telling apart, pixels.
+/// Distance below which Gaussians are merged, pixels.
 const FINE_PX: f64 = 0.8;
-/// Halvings of the number of Gaussians at most, and the least number that is halved.
+/// Largest number of halvings, and least number of Gaussians that is halved.
 const MOST_LEVELS: usize = 5;
 const LEAST_GAUSSIANS: usize = 2000;
-/// Surface that may lie before the joints, metres.
+/// Largest depth of the surface before the joints, metres.
 const AROUND_JOINTS_M: f64 = 0.2;
 
-/// Draws one avatar, in small images with fewer Gaussians.
+/// Renderer of one avatar that uses fewer Gaussians in small images.
 #[derive(Debug)]
 pub struct DetailedScene {
     gpu: GpuContext,
-    /// From the finest; the others are made when they are needed.
+    /// Levels from the finest on; coarser ones are created on demand.
     levels: Vec<Level>,
     is_detailed: bool,
-    /// Bones, and translations of the graph's nodes.
+    /// Bones and translations of the graph's nodes.
     posed: Option<(Bones, Option<Vec<DVec3>>)>,
-    /// The joints' places in the world.
+    /// World positions of the joints, metres.
     joints: Vec<DVec3>,
     /// Level of the last view.
     drawn: usize,
@@ -48,7 +48,7 @@ impl Level {
 }
 
 impl DetailedScene {
-    /// Takes an avatar over. Without `is_detailed` every view is drawn with all Gaussians.
+    /// Takes an avatar. Without `is_detailed` every view is rendered with all Gaussians.
     ///
     /// # Errors
     /// [`GpuError::TooLarge`].
@@ -57,13 +57,13 @@ impl DetailedScene {
         Ok(Self { gpu: gpu.clone(), levels, is_detailed, posed: None, joints: Vec::new(), drawn: 0 })
     }
 
-    /// The avatar with all Gaussians.
+    /// Returns the avatar with all Gaussians.
     #[must_use]
     pub fn avatar(&self) -> &Avatar {
         &self.levels[0].avatar
     }
 
-    /// Poses the avatar for the views to come; `translations` as in [`Avatar::pose`].
+    /// Poses the avatar for the following views; `translations` as in [`Avatar::pose`].
     pub fn pose(&mut self, pose: &Pose, translations: Option<&[DVec3]>) {
         let skeleton = &self.levels[0].avatar.template.skeleton;
         self.joints = skeleton.world_from_joint(pose).iter().map(|joint| joint.w_axis.truncate()).collect();
@@ -71,7 +71,7 @@ impl DetailedScene {
         self.levels.iter_mut().for_each(|level| level.is_posed = false);
     }
 
-    /// Draws the avatar as a camera sees it, at its size; straight alpha. Before the first pose nothing is there.
+    /// Renders the avatar from a camera at its image size, straight alpha. The image is empty before the first pose.
     ///
     /// # Errors
     /// [`GpuError`].
@@ -85,7 +85,7 @@ impl DetailedScene {
         level.scene.draw(camera)
     }
 
-    /// The coarsest level whose Gaussians lie closer than the nearest pixels of a camera.
+    /// Returns the coarsest level whose Gaussians lie closer than the nearest pixels of a camera.
     fn level_for(&mut self, camera: &Camera) -> Result<usize, GpuError> {
         if !self.is_detailed {
             return Ok(0);
@@ -116,14 +116,14 @@ impl DetailedScene {
         Ok(level)
     }
 
-    /// [`AvatarScene::part_box`] by the Gaussians of the last view.
+    /// Computes [`AvatarScene::part_box`] with the Gaussians of the last view.
     #[must_use]
     pub fn part_box(&self, parts: &[Part], camera: &Camera, margin_px: f64) -> Option<[u32; 4]> {
         let level = &self.levels[self.drawn];
         level.scene.part_box(&level.avatar, parts, camera, margin_px)
     }
 
-    /// Returns the Gaussians of the last view, and how many of them it left out as they face away.
+    /// Returns the number of Gaussians of the last view, and how many of them were skipped as back-facing.
     #[must_use]
     pub fn drawn(&self) -> (usize, usize) {
         let level = &self.levels[self.drawn];
@@ -148,7 +148,7 @@ mod tests {
         }
     }
 
-    /// Means over squares of `side` pixels of sRGB times coverage, 0..=255.
+    /// Returns the means over squares of `side` pixels of sRGB times coverage, 0..=255.
     fn average(view: &RenderedView, side: usize) -> Vec<f64> {
         let columns = view.width as usize / side;
         let mut means = vec![0.0; columns * (view.height as usize / side) * 3];

@@ -15,11 +15,11 @@ use crate::model::known_poses::KnownPoses;
 use crate::model::light::Light;
 use crate::model::parameters::GaussianParameters;
 
-/// Version of the format; a file of another one is refused.
+/// Version of the format; files of other versions are rejected.
 const VERSION: u32 = 2;
 /// Key of the header in the file's metadata.
 const HEADER: &str = "flyavatar";
-/// A larger file is no avatar, bytes.
+/// Largest size of an avatar's file, bytes.
 const MOST_BYTES: u64 = 1 << 30;
 
 #[derive(Serialize, Deserialize)]
@@ -41,7 +41,7 @@ struct JointRow {
     parent: Option<usize>,
 }
 
-/// Numbers of a joint: translation and rotation at rest, and the matrix from canonical space.
+/// Numbers per joint: translation and rotation at rest, and the matrix from canonical space.
 const JOINT_NUMBERS: usize = 3 + 4 + 16;
 
 fn numbers(joint: &Joint) -> [f64; JOINT_NUMBERS] {
@@ -62,7 +62,7 @@ fn joint(row: JointRow, [x, y, z, qx, qy, qz, qw, matrix @ ..]: [f64; JOINT_NUMB
     }
 }
 
-/// Arrays to write.
+/// Collection of arrays to write.
 #[derive(Default)]
 struct Arrays(Vec<(&'static str, Dtype, Vec<usize>, Vec<u8>)>);
 
@@ -81,7 +81,7 @@ impl Arrays {
     }
 }
 
-/// Rows of `N` numbers of type `T`.
+/// Reads rows of `N` numbers of type `T`.
 fn rows<T: Pod, const N: usize>(file: &SafeTensors<'_>, name: &str, dtype: Dtype) -> Result<Vec<[T; N]>, String> {
     let found = file.tensor(name).map_err(|_| format!("{name} is missing"))?;
     if found.dtype() != dtype || found.shape().len() != 2 || found.shape()[1] != N {
@@ -108,10 +108,10 @@ fn skin(file: &SafeTensors<'_>, [joints, weights]: [&str; 2]) -> Result<Vec<Skin
 }
 
 impl Avatar {
-    /// Returns the bytes of the avatar's file. The same avatar gives the same bytes.
+    /// Returns the bytes of the avatar's file. Equal avatars give equal bytes.
     ///
     /// # Errors
-    /// [`AvatarError::Format`] for numbers that cannot be written.
+    /// [`AvatarError::Format`] for non-finite numbers.
     pub fn to_bytes(&self) -> Result<Vec<u8>, AvatarError> {
         let fail = |problem: String| AvatarError::Format { path: "avatar".into(), problem };
         self.check().map_err(fail)?;
@@ -160,7 +160,7 @@ impl Avatar {
             .map_err(|error| fail(error.to_string()))
     }
 
-    /// Writes the avatar, whole or not at all.
+    /// Writes the avatar atomically.
     ///
     /// # Errors
     /// [`AvatarError::File`], [`AvatarError::Format`].
@@ -172,7 +172,7 @@ impl Avatar {
     /// Reads an avatar.
     ///
     /// # Errors
-    /// [`AvatarError::File`], and [`AvatarError::Format`] for a file that is damaged, newer, or something else.
+    /// [`AvatarError::File`], and [`AvatarError::Format`] for a file that is damaged, newer, or no avatar.
     pub fn load(path: &Path) -> Result<Self, AvatarError> {
         let file = |source| AvatarError::File { path: path.into(), source };
         let size = std::fs::metadata(path).map_err(file)?.len();
@@ -186,7 +186,7 @@ impl Avatar {
     /// Reads an avatar from the bytes of its file.
     ///
     /// # Errors
-    /// Text that says what is wrong, and what to do.
+    /// A text with the fault and its fix.
     pub fn from_bytes(bytes: &[u8]) -> Result<Self, String> {
         let foreign = || "is no avatar; build one with `flyrig avatar build`".to_owned();
         let (_, metadata) = SafeTensors::read_metadata(bytes).map_err(|_| foreign())?;
@@ -278,7 +278,7 @@ impl Avatar {
     }
 }
 
-/// Names of the learnt lists.
+/// Names of the learned lists.
 const LISTS: [&str; 4] = ["gaussians.offset", "gaussians.shape", "gaussians.rotation", "gaussians.harmonics"];
 
 #[cfg(test)]

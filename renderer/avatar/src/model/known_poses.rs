@@ -1,20 +1,20 @@
-//! Poses of the take, to tell which poses an avatar was never seen in.
+//! Poses of the take, which show how far a new pose is from all of them.
 
 use flyrig_body::{Skeleton, SkinWeights};
 use flyrig_types::Pose;
 use glam::DQuat;
 
-/// Frames of a take that are kept, evenly spaced: all of them would fill the file.
+/// Largest number of stored frames, evenly spaced: all of them would fill the file.
 const MOST_FRAMES: usize = 64;
-/// A Gaussian whose nearest frame is farther than this is in a pose unlike those of the take, radians.
+/// Distance to the nearest frame beyond which a Gaussian is in a pose unlike those of the take, radians.
 const FAR_RAD: f64 = 0.5;
 
-/// Poses of a take: local rotations of the joints, a list a frame.
+/// Poses of a take: local rotations of the joints, one list per frame.
 #[derive(Debug, Clone, PartialEq, Default)]
 pub struct KnownPoses(pub(crate) Vec<Vec<DQuat>>);
 
 impl KnownPoses {
-    /// Keeps poses of a take.
+    /// Stores poses of a take.
     #[must_use]
     pub fn new(poses: &[Pose]) -> Self {
         let step = poses.len().div_ceil(MOST_FRAMES).max(1);
@@ -23,8 +23,9 @@ impl KnownPoses {
         Self(poses.iter().step_by(step).map(rounded).collect())
     }
 
-    /// Returns the share of the Gaussians that are in a pose unlike those of the take: the joints that move them, and with a third of the
-    /// weight their parents, are turned by more than 30 degrees (root mean square) against every frame. 0 where no pose is known.
+    /// Returns the share of the Gaussians in a pose unlike those of the take: the joints that move them, and with a
+    /// third of the weight their parents, differ by more than 30 degrees (root mean square) from every frame. 0 where
+    /// no pose is known.
     #[must_use]
     pub fn far_share(&self, skeleton: &Skeleton, skin: &[SkinWeights], pose: &Pose) -> f64 {
         if self.0.is_empty() {
@@ -47,7 +48,8 @@ impl KnownPoses {
     }
 }
 
-/// Squared angles between the joints of two poses. The root turns the whole person and counts as alike, as do joints that are not finite.
+/// Returns the squared angles between the joints of two poses. They are 0 for the root, which turns the whole person,
+/// and for non-finite joints.
 fn squared_angles(a: &[DQuat], b: &[DQuat]) -> Vec<f64> {
     let angle = |(joint, (a, b)): (usize, (&DQuat, &DQuat))| {
         let angle = if joint == 0 { 0.0 } else { 2.0 * a.dot(*b).abs().min(1.0).acos() };

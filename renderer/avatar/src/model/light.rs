@@ -1,33 +1,33 @@
-//! Light of the take's room: the brightness of a surface by the direction that it faces. Colours of Gaussians are those without it, so that
-//! somebody who turns does not get the mean of lit and unlit sides.
+//! Light of the take's room: the brightness of a surface as a function of its normal. Colours of Gaussians exclude it,
+//! so that a person who turns does not get the mean of lit and unlit sides.
 //!
-//! A polynomial of second degree in the world's normal describes what distant lamps do to matte surfaces (Ramamoorthi and Hanrahan 2001);
-//! shadows that parts of the body cast on others are not in it.
+//! A second-degree polynomial in the world normal models distant lamps on matte surfaces (Ramamoorthi and Hanrahan
+//! 2001); shadows cast by other parts of the body are not modelled.
 
 use flyrig_learn::{AdamStep, Moments};
 use glam::Vec3;
 
 use crate::model::parameters::Element;
 
-/// Terms of the polynomial.
+/// Number of terms of the polynomial.
 const TERMS: usize = 9;
-/// Surfaces are not darker or brighter than this, against the light of the mean direction.
+/// Bounds of the brightness, relative to the mean over directions.
 const SHADE: std::ops::RangeInclusive<f32> = 0.05..=4.0;
 /// Rates at the start and at the end.
 const RATE: [f32; 2] = [1e-2, 1e-3];
 const BETAS: [f32; 2] = [0.9, 0.99];
-/// Gaussians that one thread sums up at once.
+/// Gaussians per task.
 const CHUNK: usize = 4096;
 
-/// Light by direction.
+/// Light as a function of the normal.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Light {
-    /// Red, green and blue of each term: 1, x, y, z, xy, yz, 3zz - 1, xz, xx - yy of the normal.
+    /// Red, green and blue per term: 1, x, y, z, xy, yz, 3zz - 1, xz, xx - yy of the normal.
     pub terms: [[f32; 3]; TERMS],
 }
 
 impl Default for Light {
-    /// The same from everywhere.
+    /// Creates uniform light.
     fn default() -> Self {
         let mut terms = [[0.0; 3]; TERMS];
         terms[0] = [1.0; 3];
@@ -41,7 +41,8 @@ fn basis(n: Vec3) -> [f32; TERMS] {
 }
 
 impl Light {
-    /// Returns the factors of red, green and blue for a surface with this world normal. One that is not finite counts as zero.
+    /// Returns the factors of red, green and blue for a surface with this world normal. A non-finite normal counts as
+    /// zero.
     #[must_use]
     pub fn shade(&self, normal: Vec3) -> [f32; 3] {
         self.unbounded(normal).map(|value| value.clamp(*SHADE.start(), *SHADE.end()))
@@ -52,8 +53,8 @@ impl Light {
         std::array::from_fn(|k| self.terms.iter().zip(basis).map(|(term, value)| term[k] * value).sum())
     }
 
-    /// Returns dL/d terms. `slopes` are dL/d lit colours, afterwards dL/d unlit ones; `unlit` are those, `stride` rows a Gaussian, `normals` by
-    /// Gaussian.
+    /// Returns dL/d terms, and converts `slopes` in place from dL/d lit colours to dL/d unlit ones. `unlit` are the
+    /// unlit colours, `stride` rows per Gaussian; `normals` has one normal per Gaussian.
     pub(crate) fn backward(
         &self,
         normals: impl Fn(usize) -> Vec3 + Sync,
@@ -86,7 +87,7 @@ impl Light {
     }
 }
 
-/// Learns a light.
+/// Learning state of a light.
 #[derive(Debug, Clone)]
 pub(crate) struct LightFit {
     pub moments: Moments,
@@ -97,7 +98,8 @@ impl LightFit {
         Self { moments: [vec![0.0; 3 * TERMS], vec![0.0; 3 * TERMS]] }
     }
 
-    /// Descends by one step, the `count`th from 1, along dL/d terms. The constant term stays: colours have its freedom.
+    /// Descends by one step, the `count`th from 1, along dL/d terms. The constant term is fixed, since colours have the
+    /// same freedom.
     pub fn descend(&mut self, light: &mut Light, slopes: &[[f32; 3]; TERMS], count: u64, progress: f32) {
         let rate = RATE[0] * (RATE[1] / RATE[0]).powf(progress.clamp(0.0, 1.0));
         let step = AdamStep { betas: BETAS, count, rate, decay: 0.0, scale: 1.0, share: 0.0 };

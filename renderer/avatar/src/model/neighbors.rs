@@ -1,20 +1,20 @@
-//! Neighbours pull each other: attributes of Gaussians that no image shows well follow those beside them (LoGAvatar Eq. 18 asks for a small
-//! standard deviation among neighbours).
+//! Pull between neighbours: attributes of poorly seen Gaussians follow those beside them (LoGAvatar Eq. 18 penalises
+//! the standard deviation among neighbours).
 
 use glam::Vec3;
 use rayon::prelude::*;
 
 use crate::model::parameters::Element;
 
-/// Neighbours of a Gaussian.
+/// Number of neighbours per Gaussian.
 const NEAREST: usize = 6;
 
-/// The nearest Gaussians of each.
+/// Nearest Gaussians of each Gaussian.
 #[derive(Debug, Clone)]
 pub(crate) struct Neighbors(Vec<[u32; NEAREST]>);
 
 impl Neighbors {
-    /// By canonical places. Where there are fewer Gaussians than neighbours, a Gaussian is its own.
+    /// Finds neighbours by canonical positions. With fewer Gaussians than neighbours, a Gaussian is its own neighbour.
     pub fn new(places: &[Vec3]) -> Self {
         // Sorted by height, those within the distance of the worst so far are near in the order.
         let mut order: Vec<u32> = (0..places.len() as u32).collect();
@@ -33,8 +33,8 @@ impl Neighbors {
         self.0.get(i).map_or(&[], |nearest| nearest.as_slice())
     }
 
-    /// Adds the derivatives of a pull to the mean of the neighbours: `weights` times the difference, by column. Rows of one Gaussian are
-    /// `stride` apart; the first one counts.
+    /// Adds the derivatives of a pull to the mean of the neighbours: `weights` times the difference, per column. A
+    /// Gaussian has `stride` rows, of which the first is pulled.
     pub fn pull(&self, values: &[Element], slopes: &mut [Element], stride: usize, weights: Element) {
         slopes.par_chunks_mut(stride).zip(&self.0).enumerate().with_min_len(1024).for_each(|(i, (slope, nearest))| {
             let (Some(slope), Some(own)) = (slope.first_mut(), values.get(i * stride)) else { return };

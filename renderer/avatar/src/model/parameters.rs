@@ -1,15 +1,15 @@
-//! Learnt attributes of an avatar's Gaussians, in canonical space.
+//! Learned attributes of an avatar's Gaussians, in canonical space.
 
 use flyrig_renderer::HarmonicOrder;
 use rayon::prelude::*;
 
-/// An element of every list: four numbers.
+/// Element of every list: four numbers.
 pub(crate) type Element = [f32; 4];
 
-/// Learnt attributes: a row a Gaussian, but as many rows of harmonics as their order has coefficients. Derivatives have the same form.
+/// Learned attributes: one row per Gaussian, and one row of harmonics per coefficient. Derivatives have the same form.
 #[derive(Debug, Clone, PartialEq)]
 pub struct GaussianParameters {
-    /// Offset from the Gaussian's place on the surface, canonical metres; w unused.
+    /// Offset from the Gaussian's position on the surface, canonical metres; w unused.
     pub offset: Vec<Element>,
     /// Logarithms of the standard deviations along the Gaussian's own axes in metres; w: logit of the opacity.
     pub shape: Vec<Element>,
@@ -21,7 +21,7 @@ pub struct GaussianParameters {
 }
 
 impl GaussianParameters {
-    /// All zero, but rotations, which are the identity.
+    /// Creates zero attributes with identity rotations.
     #[must_use]
     pub fn zeroed(count: usize, order: HarmonicOrder) -> Self {
         Self {
@@ -33,7 +33,7 @@ impl GaussianParameters {
         }
     }
 
-    /// From lists of these lengths; None where they do not belong together.
+    /// Assembles lists; `None` where their lengths do not match.
     #[must_use]
     pub fn from_lists([offset, shape, rotation, harmonics]: [Vec<Element>; 4]) -> Option<Self> {
         let count = offset.len();
@@ -41,25 +41,25 @@ impl GaussianParameters {
         (shape.len() == count && rotation.len() == count).then_some(Self { offset, shape, rotation, harmonics, order })
     }
 
-    /// Number of Gaussians.
+    /// Returns the number of Gaussians.
     #[must_use]
     pub fn len(&self) -> usize {
         self.offset.len()
     }
 
-    /// Whether there are none.
+    /// Returns whether there are no Gaussians.
     #[must_use]
     pub fn is_empty(&self) -> bool {
         self.offset.is_empty()
     }
 
-    /// Order of the colours.
+    /// Returns the harmonic order of the colours.
     #[must_use]
     pub fn order(&self) -> HarmonicOrder {
         self.order
     }
 
-    /// The lists: offset, shape, rotation, harmonics.
+    /// Returns the lists: offset, shape, rotation, harmonics.
     #[must_use]
     pub fn lists(&self) -> [&[Element]; 4] {
         [&self.offset, &self.shape, &self.rotation, &self.harmonics]
@@ -78,7 +78,7 @@ impl GaussianParameters {
         self.harmonics.resize(self.len() * self.order.coefficients(), [0.0; 4]);
     }
 
-    /// Whether every number is finite.
+    /// Returns whether every number is finite.
     #[must_use]
     pub fn is_finite(&self) -> bool {
         self.lists().iter().all(|list| list.par_iter().all(|row| row.iter().all(|value| value.is_finite())))

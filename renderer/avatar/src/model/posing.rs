@@ -1,7 +1,7 @@
-//! From canonical space into the world, and derivatives back.
+//! Posing of Gaussians from canonical space to the world, and its derivatives.
 //!
-//! A Gaussian's place is blended linearly from the bones that move it (FlyHuman Eq. 1 and 2), its rotation by the normalised blend of their
-//! quaternions.
+//! A Gaussian's position is blended linearly from its bones (FlyHuman Eq. 1 and 2), its rotation by the normalised
+//! blend of their quaternions.
 
 use flyrig_body::{Skeleton, SkinWeights, displacement};
 use flyrig_types::Pose;
@@ -11,11 +11,11 @@ use rayon::prelude::*;
 use crate::model::avatar::Avatar;
 use crate::model::parameters::{Element, GaussianParameters};
 
-/// Scales beyond these are not drawn, metres: an avatar is neither dust nor a room.
+/// Bounds of drawn scales, metres.
 const SCALE_M: std::ops::RangeInclusive<f32> = 2e-4..=0.1;
 
-/// Cosine between a surface's normal and the direction of sight from which it is not drawn. Lower ones cut the silhouette, where fitted
-/// Gaussians are rounder than the mesh: 0.35 costs 0.09 dB on d1 (docs/benchmarks/avatar.md).
+/// Cosine between a surface's normal and the line of sight above which it is not drawn. Lower values cut the
+/// silhouette, where fitted Gaussians are rounder than the mesh: 0.35 costs 0.09 dB on d1 (docs/benchmarks/avatar.md).
 const AWAY: f32 = 0.7;
 
 /// Rigid motions of the bones in one pose.
@@ -25,14 +25,14 @@ pub struct Bones {
 }
 
 impl Bones {
-    /// Of a skeleton in a pose.
+    /// Computes the motions of a skeleton in a pose.
     #[must_use]
     pub fn new(skeleton: &Skeleton, pose: &Pose) -> Self {
         let of = |matrix: &DMat4| (matrix.as_mat4(), matrix.to_scale_rotation_translation().1.as_quat().normalize());
         Self { world_from_canonical: skeleton.world_from_canonical(pose).iter().map(of).collect() }
     }
 
-    /// Bones that leave everything in canonical space.
+    /// Returns bones that leave everything in canonical space.
     #[must_use]
     pub fn at_rest(skeleton: &Skeleton) -> Self {
         Self { world_from_canonical: vec![(Mat4::IDENTITY, Quat::IDENTITY); skeleton.joints().len()] }
@@ -52,7 +52,8 @@ impl Bones {
         })
     }
 
-    /// Blends the bones of a Gaussian: linear part and translation, and rotation. Without any weight it stays at rest.
+    /// Blends the bones of a Gaussian: linear part and translation, and rotation. A Gaussian without weights stays at
+    /// rest.
     fn blend(&self, skin: &SkinWeights) -> (Mat4, Quat) {
         let (mut matrix, mut rotation, mut sum) = (Mat4::ZERO, Vec4::ZERO, 0.0);
         for bone in self.influences(skin) {
@@ -67,33 +68,33 @@ impl Bones {
     }
 }
 
-/// A bone that moves a Gaussian.
+/// Bone that moves a Gaussian.
 pub(crate) struct Influence<'a> {
-    /// Place in the Gaussian's list of weights.
+    /// Index in the Gaussian's list of weights.
     pub slot: usize,
-    /// Number of the bone.
+    /// Index of the bone.
     pub joint: usize,
-    /// Its weight, above 0; those of a Gaussian need not have the sum 1.
+    /// Weight, above 0; those of a Gaussian need not have the sum 1.
     pub weight: f32,
-    /// World from canonical space.
+    /// Transform to the world from canonical space.
     pub matrix: &'a Mat4,
-    /// Quaternion of the same turn, with the sign in which it is blended.
+    /// Quaternion of the same rotation, with the sign in which it is blended.
     pub turn: Vec4,
 }
 
-/// Motion of one Gaussian from canonical space into the world.
+/// Motion of one Gaussian from canonical space to the world.
 #[derive(Debug, Clone, Copy)]
 struct Place {
     canonical: Vec3,
     linear: Mat3,
     rotation: Quat,
-    /// By which its scales grow where the surface is stretched.
+    /// Growth of its scales where the surface is stretched.
     growth: f32,
-    /// Normal of the surface that it hangs on.
+    /// World normal of the surface that it is attached to.
     normal: Vec3,
 }
 
-/// An avatar in the world: elements for [`flyrig_renderer::AnisotropicBuffers`].
+/// Avatar in the world: elements for [`flyrig_renderer::AnisotropicBuffers`].
 #[derive(Debug, Clone, Default)]
 pub struct PosedAvatar {
     /// World centre, metres.
@@ -102,7 +103,7 @@ pub struct PosedAvatar {
     pub scale_opacity: Vec<Element>,
     /// Quaternion x, y, z, w, world from the Gaussian's axes.
     pub rotation: Vec<Element>,
-    /// Coefficients of the colours, lit, as in [`GaussianParameters::harmonics`].
+    /// Coefficients of the lit colours, as in [`GaussianParameters::harmonics`].
     pub harmonics: Vec<Element>,
     places: Vec<Place>,
 }
@@ -117,8 +118,8 @@ fn scale(logarithm: f32) -> f32 {
 }
 
 impl Avatar {
-    /// Brings all Gaussians into the world. `translations` are those of the graph's nodes, canonical metres; without them, and where there
-    /// are none, the mean of the take holds.
+    /// Poses all Gaussians. `translations` are those of the graph's nodes, canonical metres; without them the mean of
+    /// the take is used.
     pub fn pose(&self, bones: &Bones, translations: Option<&[DVec3]>, posed: &mut PosedAvatar) {
         let GaussianParameters { offset, shape, rotation, harmonics, .. } = &self.parameters;
         let nodes = self.hanging.as_ref();
@@ -158,12 +159,12 @@ impl Avatar {
     }
 }
 
-/// Poses of the take that a mean shade is taken over.
+/// Largest number of the take's poses over which shades are averaged.
 const SHADED_POSES: usize = 8;
 
 impl Avatar {
-    /// Returns the factors by which the light showed the colours of each Gaussian in the mean of the take's poses; those of the mean direction
-    /// where no pose is known.
+    /// Returns the mean light factors of each Gaussian over the take's poses; those of the mean direction where no pose
+    /// is known.
     pub(crate) fn mean_shades(&self) -> Vec<Vec3> {
         let poses = &self.known_poses.0;
         let [constant, ..] = self.light.terms;
@@ -183,8 +184,8 @@ impl Avatar {
 }
 
 impl PosedAvatar {
-    /// Copies scales and opacities; Gaussians of a surface that faces away from `eye` have none there. Opacities stay below 1, so that the far
-    /// side of the body would show through the near one. Returns how many were left out.
+    /// Copies scales and opacities, with zero for Gaussians whose surface faces away from `eye`: opacities are below 1,
+    /// so that the far side of the body would show through the near one. Returns the number of such Gaussians.
     pub(crate) fn facing(&self, eye: Vec3, scale_opacity: &mut Vec<Element>) -> usize {
         scale_opacity.clone_from(&self.scale_opacity);
         let mut hidden = 0;
@@ -205,7 +206,7 @@ impl PosedAvatar {
         avatar.light.backward(normal, harmonics, slopes, avatar.parameters.order().coefficients())
     }
 
-    /// Returns the canonical place of each Gaussian that was brought into the world, deformation and offset included, metres.
+    /// Returns the canonical position of each posed Gaussian, including deformation and offset, metres.
     pub(crate) fn canonical(&self) -> impl ExactSizeIterator<Item = Vec3> {
         self.places.iter().map(|place| place.canonical)
     }
@@ -234,7 +235,7 @@ mod tests {
     use super::*;
     use crate::model::avatar::tests::{random_pose, small};
 
-    /// A loss that weighs every number of the posed avatar.
+    /// Computes a loss that weights every number of the posed avatar.
     fn loss(avatar: &Avatar, bones: &Bones, translations: &[DVec3], weights: &[[Element; 3]]) -> f64 {
         let mut posed = PosedAvatar::default();
         avatar.pose(bones, Some(translations), &mut posed);

@@ -1,4 +1,4 @@
-//! An avatar drawn into views.
+//! Rendering of an avatar.
 
 use flyrig_body::Part;
 use flyrig_gpu::{GpuContext, GpuError};
@@ -10,7 +10,7 @@ use crate::model::avatar::{Attachment, Avatar};
 use crate::model::parameters::Element;
 use crate::model::posing::{Bones, PosedAvatar};
 
-/// A posed avatar on the adapter, as one camera sees it.
+/// Posed avatar on the adapter, as seen from one camera.
 #[derive(Debug)]
 pub(crate) struct AvatarBuffers {
     pub gaussians: AnisotropicBuffers,
@@ -30,7 +30,7 @@ impl AvatarBuffers {
         self.gaussians.harmonics.write(gpu, &posed.harmonics);
     }
 
-    /// Leaves out Gaussians that face away from a camera. Returns how many.
+    /// Hides Gaussians that face away from a camera and returns their number.
     pub fn look(&mut self, gpu: &GpuContext, posed: &PosedAvatar, camera: &Camera) -> usize {
         let eye = camera.camera_from_world.inverse().translation.as_vec3();
         let hidden = posed.facing(eye, &mut self.scale_opacity);
@@ -39,19 +39,19 @@ impl AvatarBuffers {
     }
 }
 
-/// Draws one avatar.
+/// Renderer of one avatar.
 #[derive(Debug)]
 pub struct AvatarScene {
     gpu: GpuContext,
     painter: ViewPainter,
     buffers: AvatarBuffers,
     posed: PosedAvatar,
-    /// Gaussians that the last view left out, as they face away.
+    /// Number of back-facing Gaussians skipped in the last view.
     hidden: usize,
 }
 
 impl AvatarScene {
-    /// Makes room for an avatar.
+    /// Allocates buffers for an avatar.
     ///
     /// # Errors
     /// [`GpuError::TooLarge`].
@@ -65,18 +65,18 @@ impl AvatarScene {
         })
     }
 
-    /// Poses the avatar for the views to come; see [`Avatar::pose`].
+    /// Poses the avatar for the following views; see [`Avatar::pose`].
     pub fn pose(&mut self, avatar: &Avatar, bones: &Bones, translations: Option<&[DVec3]>) {
         avatar.pose(bones, translations, &mut self.posed);
         self.buffers.pose(&self.gpu, &self.posed);
     }
 
-    /// Poses the avatar by a pose alone.
+    /// Poses the avatar by a pose alone, with its mean shape.
     pub fn drive(&mut self, avatar: &Avatar, pose: &Pose) {
         self.pose(avatar, &Bones::new(&avatar.template.skeleton, pose), None);
     }
 
-    /// Draws the avatar as a camera sees it, at its size; straight alpha.
+    /// Renders the avatar from a camera at its image size, straight alpha.
     ///
     /// # Errors
     /// [`GpuError`].
@@ -85,8 +85,8 @@ impl AvatarScene {
         self.painter.draw(&self.buffers.gaussians, camera)
     }
 
-    /// Returns the box `[x0, y0, x1, y1]` (ends excluded, pixels) around the centres of some parts' Gaussians as a camera sees them, and
-    /// `margin_px` around, within the image; None where they are not in it.
+    /// Returns the box `[x0, y0, x1, y1]` (ends excluded, pixels) around the centres of some parts' Gaussians in a
+    /// camera's image, with a margin of `margin_px`, within the image; `None` where they are outside of it.
     #[must_use]
     pub fn part_box(&self, avatar: &Avatar, parts: &[Part], camera: &Camera, margin_px: f64) -> Option<[u32; 4]> {
         let body = &avatar.template;
@@ -110,7 +110,7 @@ impl AvatarScene {
         low.cmplt(high).all().then_some([low.x as u32, low.y as u32, high.x as u32, high.y as u32])
     }
 
-    /// Returns the number of Gaussians that the last view left out, as they face away.
+    /// Returns the number of back-facing Gaussians skipped in the last view.
     #[must_use]
     pub fn hidden(&self) -> usize {
         self.hidden

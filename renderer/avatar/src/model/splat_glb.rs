@@ -10,11 +10,11 @@ use serde_json::{Map, Value, json};
 use crate::error::AvatarError;
 
 const EXTENSION: &str = "KHR_gaussian_splatting";
-/// The extension adds this to the sum of the harmonics.
+/// Constant that the extension adds to the sum of the harmonics.
 const BIAS: f32 = 0.5;
 
-/// Writes Gaussians as glTF, in linear colours of BT.709. `file_from_world` turns them so that y is up, metres. Gaussians that hold a NaN or an
-/// infinity are left out. Returns how many were written.
+/// Writes Gaussians as glTF, in linear colours of BT.709. `file_from_world` rotates them to y up, metres. Gaussians
+/// with a NaN or an infinity are skipped. Returns the number written.
 ///
 /// # Errors
 /// [`AvatarError::Body`] names the file; the old one, if any, is then untouched.
@@ -66,7 +66,7 @@ pub fn write_splat_glb(path: &Path, splats: &AnisotropicSplats, file_from_world:
     Ok(kept.len())
 }
 
-/// Degree of a coefficient, and its place within the degree: both count as the renderer's do.
+/// Returns degree and index within the degree of a coefficient, in the renderer's order.
 fn place(coefficient: usize) -> (usize, usize) {
     match coefficient {
         0 => (0, 0),

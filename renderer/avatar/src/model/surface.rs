@@ -1,5 +1,5 @@
-//! An avatar as the start of live tracking: its body with the mean shape of clothes and hair, and the colours of its Gaussians on any
-//! sampling of that surface.
+//! Avatar as the start of live tracking: its body with the mean shape of clothes and hair, and the colours of its
+//! Gaussians on any sampling of that surface.
 
 use flyrig_body::{PointGrid, SurfaceGaussians, Template, VertexMeans, displacement};
 use glam::Vec3;
@@ -8,12 +8,12 @@ use rayon::prelude::*;
 use crate::edit::atlas::{REACH, Shown};
 use crate::model::avatar::Avatar;
 
-/// Factors of the reach that are tried in turn, where no Gaussian is near.
+/// Factors of the search radius that are tried in turn, where no Gaussian is near.
 const WIDER: [f32; 3] = [1.0, 3.0, 9.0];
 
 impl Avatar {
-    /// Returns the body with the mean shape of clothes and hair over the avatar's take: the surface that a pose alone moves. Joints,
-    /// triangles, texture coordinates and normals are those of [`Self::template`].
+    /// Returns the body with the mean shape of clothes and hair over the avatar's take: the surface of an avatar driven
+    /// by a pose alone. Joints, triangles, texture coordinates and normals are those of [`Self::template`].
     #[must_use]
     pub fn surface(&self) -> Template {
         let mut template = self.template.clone();
@@ -39,8 +39,9 @@ impl Avatar {
         template
     }
 
-    /// Returns the linear RGB of each Gaussian of `surface`, sampled on [`Self::surface`] or [`Self::template`]: the avatar as it is seen
-    /// along the normal there, of order zero. Where no Gaussian of the avatar is near and faces the same way, the mean colour.
+    /// Returns the linear RGB of each Gaussian of `surface`, sampled on [`Self::surface`] or [`Self::template`]: the
+    /// avatar's colour seen along the normal, of order zero. The mean colour where no Gaussian of the avatar is near
+    /// and faces the same way.
     #[must_use]
     pub fn surface_colors(&self, surface: &SurfaceGaussians) -> Vec<[f32; 3]> {
         let shown = Shown::of(self);
@@ -75,7 +76,7 @@ mod tests {
     use crate::edit::atlas::KERNEL;
     use crate::model::avatar::tests::small;
 
-    /// An avatar whose colours follow its places, and whose clothes hang elsewhere than the body.
+    /// Creates an avatar whose colours follow its positions and whose clothes are displaced from the body.
     fn painted() -> Avatar {
         let mut avatar = small(4000, 60);
         let coefficients = avatar.parameters.order().coefficients();
@@ -88,7 +89,7 @@ mod tests {
         avatar
     }
 
-    /// The colour of one point in double precision, over all Gaussians.
+    /// Computes the colour of one point in double precision, over all Gaussians.
     fn reference(avatar: &Avatar, place: DVec3, normal: DVec3) -> DVec3 {
         let template = &avatar.template;
         let coefficients = avatar.parameters.order().coefficients();
