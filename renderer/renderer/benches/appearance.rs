@@ -7,8 +7,8 @@ mod appearance_support;
 use std::{collections::BTreeMap, error::Error, time::Duration, time::Instant};
 
 use appearance_support::{reference, scene};
-use flyrig_gpu::{AdapterChoice, GpuContext, GpuTimer, StorageBuffer};
-use flyrig_renderer::{AppearanceSettings, DiffusionHierarchy, DirectAppearance, GaussianBuffers, ViewInput};
+use flyrig_gpu::{AdapterChoice, GpuContext, GpuTimer};
+use flyrig_renderer::{AppearanceSettings, DiffusionHierarchy, DirectAppearance, GaussianBuffers};
 use glam::DVec4;
 
 const RUNS: u32 = 20;
@@ -35,25 +35,8 @@ fn main() -> Result<(), Box<dyn Error>> {
         .iter()
         .map(|camera| scene::view(&frame, camera, [255, 0, 255], scene::pattern))
         .collect();
-    let maps = views
-        .iter()
-        .map(|view| {
-            let upload = |map: &[[f32; 4]]| StorageBuffer::from_slice(&gpu, "map", map);
-            let image = StorageBuffer::from_bytes(&gpu, "image", &view.rgba)?;
-            Ok((image, upload(&view.canonical)?, upload(&view.drawn)?))
-        })
-        .collect::<Result<Vec<_>, flyrig_gpu::GpuError>>()?;
-    let inputs: Vec<_> = views
-        .iter()
-        .zip(&maps)
-        .map(|(view, (picture, canonical, drawn))| ViewInput {
-            camera: &view.camera,
-            picture,
-            canonical,
-            drawn,
-            gaussians: None,
-        })
-        .collect();
+    let maps = scene::upload(&gpu, &views)?;
+    let inputs = scene::inputs(&views, &maps);
 
     let mut appearance = DirectAppearance::new(&gpu, &person.surface, &person.graph, 3)?;
     let mut timer = GpuTimer::new(&gpu, 4);

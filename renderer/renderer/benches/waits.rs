@@ -92,7 +92,7 @@ fn main() -> Result<(), Box<dyn Error>> {
         ended(1)?;
         let mut inputs = Vec::new();
         for (camera, RenderTarget { canonical, color, .. }) in cameras.iter().zip(&targets) {
-            inputs.push(ViewInput { camera, picture: &picture, canonical, drawn: color, gaussians: None });
+            inputs.push(ViewInput { camera, picture: &picture, canonical, rendered: color, gaussians: None });
         }
         let mut encoder = gpu.device.create_command_encoder(&Default::default());
         appearance.update(&gpu, &mut encoder, &gaussians, &inputs, &AppearanceSettings::default())?;

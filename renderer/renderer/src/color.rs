@@ -30,6 +30,14 @@ fn byte(value: f32) -> u8 {
 ///
 /// The colour is un-premultiplied in linear light and then encoded, so that multiplying the sRGB bytes by alpha gives
 /// the image on black as an ordinary 8-bit compositor (and our evaluation) computes it.
+///
+/// # Examples
+/// ```
+/// use flyrig_renderer::rgba8_from_target;
+///
+/// // Half-covered white, premultiplied.
+/// assert_eq!(rgba8_from_target(&[[0.5, 0.5, 0.5, 0.5]]), [255, 255, 255, 128]);
+/// ```
 #[must_use]
 pub fn rgba8_from_target(color: &[[f32; 4]]) -> Vec<u8> {
     use rayon::prelude::*;

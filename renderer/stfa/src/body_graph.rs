@@ -17,6 +17,22 @@ const OCTAVES: usize = 3;
 const MIN_POOL_WEIGHT: f32 = 0.25;
 
 /// Deformation graph in the form that the networks take.
+///
+/// # Examples
+/// ```
+/// use flyrig_body::{DEFAULT_SIGMA2_M2, ShapeParams, build_graph, default_template, sample_surface};
+/// use flyrig_stfa::{BodyGraph, LearnedAppearance, Parameters};
+///
+/// let template = default_template(&ShapeParams::default())?;
+/// let surface = sample_surface(&template, 2000, 1)?;
+/// let graph = build_graph(&template, &surface, 100, DEFAULT_SIGMA2_M2)?;
+/// let body = BodyGraph::new(&surface, &graph)?;
+/// assert_eq!((body.gaussians(), body.nodes()), (2000, graph.nodes.len()));
+/// // The same weights serve every body.
+/// let networks = LearnedAppearance::new(&Parameters::named("tiny".as_ref())?, body);
+/// assert_eq!(networks.counts.views_encoded, 0);
+/// # Ok::<(), Box<dyn std::error::Error>>(())
+/// ```
 #[derive(Debug, Clone, PartialEq)]
 pub struct BodyGraph {
     /// Nodes of each Gaussian.
@@ -32,6 +48,8 @@ pub struct BodyGraph {
 }
 
 impl BodyGraph {
+    /// Builds the graph of a body from its Gaussians and its deformation graph.
+    ///
     /// # Errors
     /// [`StfaError::Body`] where Gaussians and graph do not fit each other.
     pub fn new(surface: &SurfaceGaussians, graph: &DeformationGraph) -> Result<Self, StfaError> {

@@ -11,7 +11,7 @@ use crate::{
     body_graph::PLACE,
     inputs::{NODE, STATE},
     network::{Network, feature_maps, linear_from_srgb, srgb_from_linear},
-    sample::{SHARES, Target, TrainingSample},
+    sample::{SHARES, TargetPixels, TrainingSample},
     structure::{fine_contrast, structural_similarity},
     taps::Taps,
     variation::Variation,
@@ -110,7 +110,7 @@ impl Comparison {
     pub(crate) fn new(
         network: &Network,
         sample: &TrainingSample,
-        target: &Target,
+        target: &TargetPixels,
         [visible, node_feature]: [Tensor<2>; 2],
         variation: Variation,
     ) -> Self {
@@ -194,7 +194,7 @@ pub(crate) fn number(tensor: Tensor<1>) -> f64 {
 fn with_graph(
     network: &Network,
     sample: &TrainingSample,
-    target: &Target,
+    target: &TargetPixels,
     [visible, node_feature]: [Tensor<2>; 2],
     state: &[[f32; STATE]],
     variation: Variation,

@@ -95,7 +95,7 @@ impl Crops {
         out
     }
 
-    /// sRGB values times mask weight, and the weight.
+    /// Returns sRGB values times mask weight, and the weight.
     #[must_use]
     pub fn colors(&self, settings: &AppearanceSettings) -> FeatureMaps {
         let values = self.rgba.par_chunks_exact(4).flat_map_iter(|pixel| believed(pixel, settings)).collect();

@@ -40,7 +40,7 @@ pub use inputs::{CANDIDATES, FrameInputs, NODE, STATE, frame_inputs};
 pub use memory::FeatureMemory;
 pub use paint::{LearnedAppearance, PaintCounts};
 pub use parameters::{NetworkSize, Parameters};
-pub use sample::{PATCH, SHARES, Target, TargetImage, TrainingSample, training_sample};
+pub use sample::{PATCH, SHARES, TargetImage, TargetPixels, TrainingSample, training_sample};
 pub use taps::{FeatureMaps, Tap, Taps};
 pub use train::{Loss, TrainSettings, Trainer};
 pub use weights::{EMBEDDED, WEIGHTS_VERSION};

@@ -14,8 +14,8 @@ pub struct FeatureMemory {
 }
 
 impl FeatureMemory {
-    /// Puts a memory together from w_acc of each Gaussian and f_acc, `width` numbers per Gaussian. Returns `None` for
-    /// lengths that do not fit each other, numbers that are not finite, and negative weights.
+    /// Assembles a memory from w_acc of each Gaussian and f_acc, `width` numbers per Gaussian. Returns `None` for
+    /// mismatched lengths, non-finite numbers, and negative weights.
     #[must_use]
     pub fn from_parts(width: usize, weights: Vec<f32>, features: Vec<f32>) -> Option<Self> {
         let fits = weights.len().checked_mul(width) == Some(features.len());

@@ -85,10 +85,22 @@ impl NetworkSize {
     }
 }
 
-/// Returns the outputs of the colour network: step towards each candidate, and three residuals.
+/// Number of outputs of the colour network: step towards each candidate, and three residuals.
 pub(crate) const OUTPUTS: usize = CANDIDATES + 3;
 
 /// Parameters by name.
+///
+/// # Examples
+/// ```
+/// use flyrig_stfa::{NetworkSize, Parameters};
+///
+/// let bundled = Parameters::named("tiny".as_ref())?;
+/// assert_eq!(bundled.size, NetworkSize::TINY);
+/// let untrained = Parameters::untrained(NetworkSize::TINY, 1);
+/// assert_eq!(untrained.count(), bundled.count());
+/// assert_ne!(untrained.digest(), bundled.digest());
+/// # Ok::<(), flyrig_stfa::StfaError>(())
+/// ```
 #[derive(Debug, Clone, PartialEq)]
 pub struct Parameters {
     /// Size of the networks that they belong to.

@@ -38,7 +38,7 @@ pub struct TargetImage<'a> {
 
 /// Pixels of one held-out image and the Gaussians that they show.
 #[derive(Debug, Clone, PartialEq, Default)]
-pub struct Target {
+pub struct TargetPixels {
     /// Samples of the feature maps, one row per Gaussian.
     pub taps: Taps,
     /// State per Gaussian, [`STATE`] numbers.
@@ -69,7 +69,7 @@ pub struct TrainingSample {
     /// Positional encoding of each node.
     pub place: Vec<[f32; PLACE]>,
     /// Held-out images.
-    pub targets: Vec<Target>,
+    pub targets: Vec<TargetPixels>,
 }
 
 /// Gathers a sample: the networks' inputs from `pictures` and their observations by direct appearance, and `patches`
@@ -100,7 +100,7 @@ pub fn training_sample(
         let shown = pixel_shares(target.camera, posed, &pixels, &RasterSettings::default()).rows;
         let mut places: HashMap<u32, u32> = HashMap::new();
         let mut which: Vec<u32> = Vec::new();
-        let mut out = Target::default();
+        let mut out = TargetPixels::default();
         for (row, &[x, y]) in shown.into_iter().zip(&pixels) {
             let (mut gaussians, mut shares) = ([0; SHARES], [0.0; SHARES]);
             let alpha: f32 = row.iter().map(|(_, share)| share).sum();
@@ -217,8 +217,8 @@ impl TrainingSample {
             rgba: array(file, "crop_rgba", &[views, height, width, 4])?,
         };
         let count = array::<u32>(file, "targets", &[1])?[0];
-        let target = |i: u32| -> Result<Target, String> {
-            Ok(Target {
+        let target = |i: u32| -> Result<TargetPixels, String> {
+            Ok(TargetPixels {
                 taps: taps(file, &format!("{i}"))?,
                 state: rows(file, &format!("{i}.state"))?,
                 nodes: rows(file, &format!("{i}.nodes"))?,

@@ -57,7 +57,7 @@ mod tests {
         f64::from(flyrig_learn::to_vec(structural_similarity(rows(a), rows(b)))[0])
     }
 
-    /// Reference in f64, window by window, from differences to the mean.
+    /// Computes the reference in f64, window by window, from differences to the mean.
     fn reference(a: &[f32], b: &[f32]) -> f64 {
         let (mut sum, mut count) = (0.0, 0.0);
         for patch in 0..a.len() / (3 * PATCH * PATCH) {

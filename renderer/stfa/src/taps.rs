@@ -235,7 +235,7 @@ mod tests {
         (taps, levels)
     }
 
-    /// Reference of the interpolation in f64.
+    /// Computes the interpolation in f64.
     fn reference(taps: &Taps, levels: &[FeatureMaps], row: usize) -> Vec<f64> {
         let mut out = Vec::new();
         for level in levels {

@@ -20,7 +20,7 @@ use crate::{
     Parameters, StfaError,
     comparison::{Comparison, PixelLoss, planes},
     network::{Network, feature_maps},
-    sample::{Target, TrainingSample},
+    sample::{TargetPixels, TrainingSample},
     taps::Taps,
     tensor_file::{TensorFile, array, read},
     variation::Variation,
@@ -140,7 +140,7 @@ impl Trainer {
     fn gradients(
         &self,
         sample: &TrainingSample,
-        target: &Target,
+        target: &TargetPixels,
         variation: Variation,
     ) -> Option<(PixelLoss, BTreeMap<String, Vec<f32>>)> {
         let device = Device::flex().autodiff();

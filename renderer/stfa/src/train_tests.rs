@@ -45,7 +45,7 @@ fn sample(seed: u64) -> TrainingSample {
             [byte(mean(0) * 1.3), byte(mean(1)), byte(mean(2)), 255]
         })
         .collect();
-    let target = Target {
+    let target = TargetPixels {
         taps,
         nodes: (0..gaussians).map(|_| std::array::from_fn(|_| rng.random_range(0..nodes))).collect(),
         node_weights: vec![[0.25; 4]; gaussians as usize],

@@ -64,7 +64,7 @@ impl Variation {
     }
 }
 
-/// Returns the offsets of the candidates in a state.
+/// Offsets of the candidates in a state.
 const CANDIDATE_PLACES: [usize; CANDIDATES] = {
     let mut places = [0; CANDIDATES];
     let mut i = 0;

@@ -107,7 +107,7 @@ impl Stage {
                 camera,
                 picture,
                 canonical: &target.canonical,
-                drawn: &target.color,
+                rendered: &target.color,
                 gaussians: None,
             })
             .collect();

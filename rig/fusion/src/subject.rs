@@ -488,7 +488,7 @@ impl Subject {
                 camera: views[i].camera,
                 picture: &self.inputs[i].words,
                 canonical: &self.visibility[i].canonical,
-                drawn: &self.visibility[i].color,
+                rendered: &self.visibility[i].color,
                 gaussians: (instant_of[i] > 0).then(|| instants[instant_of[i]].1),
             })
             .collect();

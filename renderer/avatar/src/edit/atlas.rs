@@ -248,7 +248,7 @@ mod tests {
     use super::*;
     use crate::model::avatar::tests::small;
 
-    /// Slow reference: every Gaussian for every texel, in f64.
+    /// Compares with a slow reference: every Gaussian for every texel, in f64.
     #[test]
     fn texels_mix_the_gaussians_near_them() {
         let mut avatar = small(800, 5);

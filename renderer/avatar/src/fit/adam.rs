@@ -88,7 +88,7 @@ mod tests {
         assert!((values[7][0] - 3.0).abs() < 1e-6);
     }
 
-    /// Reference in f64: the published formula except for the denominator.
+    /// Compares with the published formula in f64, except for the denominator.
     #[test]
     fn steps_are_those_of_the_formula() {
         let slopes = [0.5f64, -0.2, 0.1, 0.7, -1.5];

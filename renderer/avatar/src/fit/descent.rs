@@ -103,14 +103,14 @@ pub struct StepReport {
 /// Rendered image and its derivatives, of one size, on the adapter.
 #[derive(Debug)]
 struct Targets {
-    drawn: RenderTarget,
+    rendered: RenderTarget,
     slopes: ImageGradients,
 }
 
 impl Targets {
     fn new(gpu: &GpuContext, [width, height]: [u32; 2]) -> Result<Self, AvatarError> {
-        let drawn = RenderTarget::new(gpu, width, height)?;
-        Ok(Self { drawn, slopes: ImageGradients::zeroed(gpu, width, height)? })
+        let rendered = RenderTarget::new(gpu, width, height)?;
+        Ok(Self { rendered, slopes: ImageGradients::zeroed(gpu, width, height)? })
     }
 }
 
@@ -229,7 +229,7 @@ impl Fit {
         let index = self.next_view();
         let (error, bones) = self.draw(avatar, index)?;
         let view = &self.views[index];
-        let Some(Targets { drawn, slopes }) = self.targets.get(&view.size()) else {
+        let Some(Targets { rendered, slopes }) = self.targets.get(&view.size()) else {
             return Err(AvatarError::Images("an image has no target".to_owned()));
         };
         slopes.color.write(&self.gpu, &error.slope);
@@ -240,7 +240,7 @@ impl Fit {
             &mut encoder,
             &self.rasterizer,
             &self.buffers.gaussians,
-            drawn,
+            rendered,
             slopes,
             &self.gradients,
         )?;
@@ -338,16 +338,16 @@ impl Fit {
         avatar.pose(&bones, translations, &mut self.posed);
         self.buffers.pose(&self.gpu, &self.posed);
         let size = view.size();
-        let Targets { drawn, .. } = match self.targets.entry(size) {
+        let Targets { rendered, .. } = match self.targets.entry(size) {
             Entry::Occupied(entry) => entry.into_mut(),
             Entry::Vacant(entry) => entry.insert(Targets::new(&self.gpu, size)?),
         };
         let settings =
             RasterSettings { outputs: Outputs { canonical: false, ..Outputs::ALL }, ..RasterSettings::default() };
         let mut encoder = self.gpu.device.create_command_encoder(&Default::default());
-        self.rasterizer.encode(&self.gpu, &mut encoder, &self.buffers.gaussians, &view.camera, &settings, drawn)?;
+        self.rasterizer.encode(&self.gpu, &mut encoder, &self.buffers.gaussians, &view.camera, &settings, rendered)?;
         self.gpu.queue.submit([encoder.finish()]);
-        let pixels = drawn.color.read(&self.gpu)?;
+        let pixels = rendered.color.read(&self.gpu)?;
         let difference = ImageDifference::of(&pixels, view.photograph(), size[0] as usize, &self.settings.weights);
         Ok((difference, bones))
     }

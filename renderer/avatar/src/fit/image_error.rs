@@ -83,15 +83,15 @@ impl Shown {
 
 /// Returns the sum of absolute differences of two planes' unsharp masks (LoGAvatar Eq. 17), and its derivative with
 /// respect to `drawn`.
-fn sharpness(drawn: &[f32], wanted: &[f32], width: usize) -> (f64, Vec<f32>) {
-    let count = drawn.len().min(wanted.len());
+fn sharpness(rendered: &[f32], wanted: &[f32], width: usize) -> (f64, Vec<f32>) {
+    let count = rendered.len().min(wanted.len());
     if width == 0 || count < width {
-        return (0.0, vec![0.0; drawn.len()]);
+        return (0.0, vec![0.0; rendered.len()]);
     }
     let blur = Blur::new(width);
     // Linear and its own transpose.
     let detail = |plane: Vec<f32>| -> Vec<f32> { plane.iter().zip(blur.apply(&plane)).map(|(a, b)| a - b).collect() };
-    let difference = detail(drawn.iter().zip(wanted).map(|(a, b)| a - b).collect());
+    let difference = detail(rendered.iter().zip(wanted).map(|(a, b)| a - b).collect());
     let sum = difference.iter().map(|value| f64::from(value.abs())).sum();
     let sign = |value: &f32| if *value > 0.0 { 1.0 } else { -1.0 };
     (sum, detail(difference.iter().map(sign).collect()))
@@ -110,12 +110,12 @@ impl ImageDifference {
     /// Compares a rendered image (premultiplied linear RGB, coverage) with a photograph of `width` pixels per row. A
     /// non-finite pixel counts as transparent and has no slope.
     #[must_use]
-    pub fn of(drawn: &[[f32; 4]], photograph: Photograph<'_>, width: usize, weights: &ErrorWeights) -> Self {
+    pub fn of(rendered: &[[f32; 4]], photograph: Photograph<'_>, width: usize, weights: &ErrorWeights) -> Self {
         let wanted = photograph.rgba;
         let is_mixed = |i: usize| photograph.mixed.get(i).is_some_and(|mixed| *mixed);
-        let count = drawn.len().min(wanted.len() / 4);
+        let count = rendered.len().min(wanted.len() / 4);
         let whole = |pixel: &[f32; 4]| if pixel.iter().all(|value| value.is_finite()) { *pixel } else { [0.0; 4] };
-        let pixels: Vec<[f32; 4]> = drawn[..count].iter().map(whole).collect();
+        let pixels: Vec<[f32; 4]> = rendered[..count].iter().map(whole).collect();
         let shown: Vec<Shown> = pixels.par_iter().with_min_len(4096).map(|pixel| Shown::of(*pixel)).collect();
         let unit = |code: u8| f32::from(code) / 255.0;
         let mask: Vec<f32> = wanted.chunks_exact(4).take(count).map(|pixel| unit(pixel[3])).collect();
@@ -176,7 +176,7 @@ impl ImageDifference {
             error.loss += f64::from(weights.coverage * difference.abs()) / person;
             slope[3] += scale * weights.coverage * if difference > 0.0 { 1.0 } else { -1.0 };
         }
-        for (slope, pixel) in error.slope.iter_mut().zip(drawn) {
+        for (slope, pixel) in error.slope.iter_mut().zip(rendered) {
             if !pixel.iter().all(|value| value.is_finite()) {
                 *slope = [0.0; 4];
             }
@@ -199,7 +199,7 @@ mod tests {
     fn slopes_are_those_of_finite_differences() {
         let mut random = StdRng::seed_from_u64(4);
         let width = 12;
-        let mut drawn: Vec<[f32; 4]> = (0..width * 10)
+        let mut rendered: Vec<[f32; 4]> = (0..width * 10)
             .map(|_| {
                 let alpha = random.random_range(0.1f32..0.99);
                 [0; 3]
@@ -212,15 +212,15 @@ mod tests {
             .collect();
         let wanted: Vec<u8> = (0..width * 10 * 4).map(|_| random.random()).collect();
         let weights = ErrorWeights { color: 0.8, structure: 0.2, coverage: 0.3, sharpness: 0.7 };
-        let slope = ImageDifference::of(&drawn, photograph(&wanted), width, &weights).slope;
+        let slope = ImageDifference::of(&rendered, photograph(&wanted), width, &weights).slope;
         let mut worst = 0.0f64;
-        for i in (0..drawn.len()).step_by(3) {
+        for i in (0..rendered.len()).step_by(3) {
             for k in 0..4 {
                 let step = 1e-3;
                 let mut at = |by: f32| {
-                    drawn[i][k] += by;
-                    let loss = ImageDifference::of(&drawn, photograph(&wanted), width, &weights).loss;
-                    drawn[i][k] -= by;
+                    rendered[i][k] += by;
+                    let loss = ImageDifference::of(&rendered, photograph(&wanted), width, &weights).loss;
+                    rendered[i][k] -= by;
                     loss
                 };
                 let expected = (at(step) - at(-step)) / f64::from(2.0 * step);
@@ -234,11 +234,11 @@ mod tests {
     fn the_color_of_mixed_pixels_does_not_count_and_their_coverage_does() {
         let mut random = StdRng::seed_from_u64(8);
         let width = 14;
-        let drawn: Vec<[f32; 4]> = (0..width * 12).map(|_| [0.1, 0.2, 0.3, random.random_range(0.4..0.9)]).collect();
-        let mut rgba: Vec<u8> = (0..drawn.len() * 4).map(|_| random.random()).collect();
-        let mixed: Vec<bool> = (0..drawn.len()).map(|_| random.random()).collect();
+        let rendered: Vec<[f32; 4]> = (0..width * 12).map(|_| [0.1, 0.2, 0.3, random.random_range(0.4..0.9)]).collect();
+        let mut rgba: Vec<u8> = (0..rendered.len() * 4).map(|_| random.random()).collect();
+        let mixed: Vec<bool> = (0..rendered.len()).map(|_| random.random()).collect();
         let weights = ErrorWeights { sharpness: 0.5, ..ErrorWeights::default() };
-        let of = |rgba: &[u8]| ImageDifference::of(&drawn, Photograph { rgba, mixed: &mixed }, width, &weights);
+        let of = |rgba: &[u8]| ImageDifference::of(&rendered, Photograph { rgba, mixed: &mixed }, width, &weights);
         let before = of(&rgba);
         for (pixel, _) in rgba.chunks_exact_mut(4).zip(&mixed).filter(|(_, mixed)| **mixed) {
             pixel[..3].iter_mut().for_each(|code| *code = !*code);
@@ -248,7 +248,7 @@ mod tests {
         for (slope, _) in before.slope.iter().zip(&mixed).filter(|(_, mixed)| **mixed) {
             assert!(slope[..3].iter().all(|slope| slope.abs() <= 0.0) && (slope[3].abs() - scale).abs() < 1e-3 * scale);
         }
-        assert!(before != ImageDifference::of(&drawn, photograph(&rgba), width, &weights));
+        assert!(before != ImageDifference::of(&rendered, photograph(&rgba), width, &weights));
     }
 
     #[test]
@@ -256,8 +256,8 @@ mod tests {
         let mut random = StdRng::seed_from_u64(6);
         let (width, height) = (40, 30);
         let wanted: Vec<f32> = (0..width * height).map(|_| random.random()).collect();
-        let mut drawn: Vec<f32> = (0..width * height).map(|_| random.random()).collect();
-        let (sum, slope) = sharpness(&drawn, &wanted, width);
+        let mut rendered: Vec<f32> = (0..width * height).map(|_| random.random()).collect();
+        let (sum, slope) = sharpness(&rendered, &wanted, width);
         // The definition, in f64 and two dimensions.
         let weight = |d: f64| (-0.5 * (d / 1.5f64).powi(2)).exp();
         let total: f64 = (-5..=5).map(|d| weight(f64::from(d))).sum();
@@ -267,7 +267,7 @@ mod tests {
                 let at = |x: i64, y: i64| {
                     let inside = (0..width as i64).contains(&x) && (0..height as i64).contains(&y);
                     let i = (y * width as i64 + x) as usize;
-                    if inside { f64::from(drawn[i]) - f64::from(wanted[i]) } else { 0.0 }
+                    if inside { f64::from(rendered[i]) - f64::from(wanted[i]) } else { 0.0 }
                 };
                 let taps = (-5..=5i64).flat_map(|dy| (-5..=5i64).map(move |dx| (dx, dy)));
                 let smooth: f64 = taps.map(|(dx, dy)| weight(dx as f64) * weight(dy as f64) * at(x + dx, y + dy)).sum();
@@ -275,13 +275,13 @@ mod tests {
             }
         }
         assert!((sum - expected).abs() < 1e-3 * expected, "{sum} {expected}");
-        for i in (0..drawn.len()).step_by(17) {
+        for i in (0..rendered.len()).step_by(17) {
             let step = 1e-3;
-            drawn[i] += step;
-            let more = sharpness(&drawn, &wanted, width).0;
-            drawn[i] -= 2.0 * step;
-            let expected = (more - sharpness(&drawn, &wanted, width).0) / f64::from(2.0 * step);
-            drawn[i] += step;
+            rendered[i] += step;
+            let more = sharpness(&rendered, &wanted, width).0;
+            rendered[i] -= 2.0 * step;
+            let expected = (more - sharpness(&rendered, &wanted, width).0) / f64::from(2.0 * step);
+            rendered[i] += step;
             assert!((expected - f64::from(slope[i])).abs() < 0.2, "{i}: {expected} {}", slope[i]);
         }
         // A smooth difference hardly counts inside.
@@ -297,13 +297,13 @@ mod tests {
             let code = f32::from(code) / 255.0;
             if code <= 0.040_45 { code / 12.92 } else { ((code + 0.055) / 1.055).powf(2.4) }
         };
-        let mut drawn: Vec<[f32; 4]> =
+        let mut rendered: Vec<[f32; 4]> =
             wanted.chunks_exact(4).map(|p| [linear(p[0]), linear(p[1]), linear(p[2]), 1.0]).collect();
-        let error = ImageDifference::of(&drawn, photograph(&wanted), 20, &ErrorWeights::default());
+        let error = ImageDifference::of(&rendered, photograph(&wanted), 20, &ErrorWeights::default());
         assert!(error.loss < 1e-3 && error.squared < 1e-8, "{} {}", error.loss, error.squared);
-        drawn[3] = [f32::NAN, 0.0, 0.0, 1.0];
-        drawn[5] = [f32::INFINITY; 4];
-        let error = ImageDifference::of(&drawn, photograph(&wanted), 20, &ErrorWeights::default());
+        rendered[3] = [f32::NAN, 0.0, 0.0, 1.0];
+        rendered[5] = [f32::INFINITY; 4];
+        let error = ImageDifference::of(&rendered, photograph(&wanted), 20, &ErrorWeights::default());
         assert!(
             error.loss.is_finite()
                 && error.slope[3].iter().all(|v| v.abs() <= 0.0)

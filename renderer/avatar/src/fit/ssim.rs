@@ -57,16 +57,19 @@ impl Blur {
 
 /// Returns the sum of the similarity over all pixels of a plane, values 0..=1, and its derivative with respect to
 /// `drawn`. Both planes have complete rows of `width` pixels; without a pixel the sum is 0.
-pub(crate) fn ssim(drawn: &[f32], wanted: &[f32], width: usize) -> (f64, Vec<f32>) {
-    let count = drawn.len().min(wanted.len());
+pub(crate) fn ssim(rendered: &[f32], wanted: &[f32], width: usize) -> (f64, Vec<f32>) {
+    let count = rendered.len().min(wanted.len());
     if width == 0 || count < width {
-        return (0.0, vec![0.0; drawn.len()]);
+        return (0.0, vec![0.0; rendered.len()]);
     }
     let blur = Blur::new(width);
     let product = |a: &[f32], b: &[f32]| -> Vec<f32> { a.iter().zip(b).map(|(a, b)| a * b).collect() };
-    let (mean_x, mean_y) = (blur.apply(drawn), blur.apply(wanted));
-    let (xx, yy, xy) =
-        (blur.apply(&product(drawn, drawn)), blur.apply(&product(wanted, wanted)), blur.apply(&product(drawn, wanted)));
+    let (mean_x, mean_y) = (blur.apply(rendered), blur.apply(wanted));
+    let (xx, yy, xy) = (
+        blur.apply(&product(rendered, rendered)),
+        blur.apply(&product(wanted, wanted)),
+        blur.apply(&product(rendered, wanted)),
+    );
     let (mut by_mean, mut by_square, mut by_product) = (vec![0.0; count], vec![0.0; count], vec![0.0; count]);
     let mut sum = 0.0;
     for i in 0..count {
@@ -81,7 +84,7 @@ pub(crate) fn ssim(drawn: &[f32], wanted: &[f32], width: usize) -> (f64, Vec<f32
         by_mean[i] = 2.0 * y * a2 * inverse - 2.0 * x * similarity / b1 - 2.0 * x * by_square[i] - y * by_product[i];
     }
     let (by_mean, by_square, by_product) = (blur.apply(&by_mean), blur.apply(&by_square), blur.apply(&by_product));
-    let slope = (0..count).map(|i| by_mean[i] + 2.0 * drawn[i] * by_square[i] + wanted[i] * by_product[i]).collect();
+    let slope = (0..count).map(|i| by_mean[i] + 2.0 * rendered[i] * by_square[i] + wanted[i] * by_product[i]).collect();
     (sum, slope)
 }
 
@@ -91,9 +94,9 @@ mod tests {
 
     use super::*;
 
-    /// Reference by the definition, pixel by pixel in f64.
-    fn reference(drawn: &[f64], wanted: &[f64], width: usize) -> f64 {
-        let height = drawn.len() / width;
+    /// Computes the definition, pixel by pixel in f64.
+    fn reference(rendered: &[f64], wanted: &[f64], width: usize) -> f64 {
+        let height = rendered.len() / width;
         let weight = |d: i64| (-0.5 * (d as f64 / DEVIATION).powi(2)).exp();
         let total: f64 = (-5..=5).map(weight).sum();
         let mut sum = 0.0;
@@ -112,10 +115,10 @@ mod tests {
                     }
                     mean
                 };
-                let (mx, my) = (mean(&|i| drawn[i]), mean(&|i| wanted[i]));
-                let vx = mean(&|i| drawn[i] * drawn[i]) - mx * mx;
+                let (mx, my) = (mean(&|i| rendered[i]), mean(&|i| wanted[i]));
+                let vx = mean(&|i| rendered[i] * rendered[i]) - mx * mx;
                 let vy = mean(&|i| wanted[i] * wanted[i]) - my * my;
-                let vxy = mean(&|i| drawn[i] * wanted[i]) - mx * my;
+                let vxy = mean(&|i| rendered[i] * wanted[i]) - mx * my;
                 let (c1, c2) = (1e-4, 9e-4);
                 sum += (2.0 * mx * my + c1) * (2.0 * vxy + c2) / ((mx * mx + my * my + c1) * (vx + vy + c2));
             }
@@ -128,15 +131,15 @@ mod tests {
         let mut random = StdRng::seed_from_u64(2);
         for (width, height) in [(1, 1), (3, 17), (24, 9), (13, 13)] {
             let plane = |random: &mut StdRng| -> Vec<f64> { (0..width * height).map(|_| random.random()).collect() };
-            let (mut drawn, wanted) = (plane(&mut random), plane(&mut random));
+            let (mut rendered, wanted) = (plane(&mut random), plane(&mut random));
             let narrow = |plane: &[f64]| -> Vec<f32> { plane.iter().map(|value| *value as f32).collect() };
-            let (sum, slope) = ssim(&narrow(&drawn), &narrow(&wanted), width);
-            assert!((sum - reference(&drawn, &wanted, width)).abs() < 1e-3 * drawn.len() as f64, "{width} {sum}");
-            for i in (0..drawn.len()).step_by(5) {
+            let (sum, slope) = ssim(&narrow(&rendered), &narrow(&wanted), width);
+            assert!((sum - reference(&rendered, &wanted, width)).abs() < 1e-3 * rendered.len() as f64, "{width} {sum}");
+            for i in (0..rendered.len()).step_by(5) {
                 let mut at = |by: f64| {
-                    drawn[i] += by;
-                    let found = reference(&drawn, &wanted, width);
-                    drawn[i] -= by;
+                    rendered[i] += by;
+                    let found = reference(&rendered, &wanted, width);
+                    rendered[i] -= by;
                     found
                 };
                 let expected = (at(1e-5) - at(-1e-5)) / 2e-5;

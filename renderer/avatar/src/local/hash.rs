@@ -116,7 +116,7 @@ mod tests {
 
     use super::*;
 
-    /// Reference by the definition, in f64.
+    /// Computes features by the definition, in f64.
     fn reference(place: Vec3, around: Box3, tables: &[f64]) -> Vec<f64> {
         let mut features = Vec::new();
         for level in 0..LEVELS {

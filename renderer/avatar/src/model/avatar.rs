@@ -77,6 +77,28 @@ impl Attachment {
 }
 
 /// Personal avatar. All lists of Gaussians have the same length.
+///
+/// # Examples
+/// ```
+/// use flyrig_avatar::{Avatar, Bones, PosedAvatar};
+/// use flyrig_body::{ShapeParams, default_template, sample_surface};
+/// use flyrig_renderer::HarmonicOrder;
+///
+/// let template = default_template(&ShapeParams::default())?;
+/// let surface = sample_surface(&template, 500, 1)?;
+/// let avatar = Avatar::new(&template, &surface, None, &[], HarmonicOrder::Zero)?;
+///
+/// // The file restores the same avatar.
+/// assert!(Avatar::from_bytes(&avatar.to_bytes()?)? == avatar);
+///
+/// // Pose it.
+/// let mut pose = template.skeleton.rest_pose();
+/// pose.root_translation.x += 1.0;
+/// let mut posed = PosedAvatar::default();
+/// avatar.pose(&Bones::new(&template.skeleton, &pose), None, &mut posed);
+/// assert_eq!(posed.center.len(), 500);
+/// # Ok::<(), Box<dyn std::error::Error>>(())
+/// ```
 #[derive(Debug, Clone, PartialEq)]
 pub struct Avatar {
     /// Body, clothes included.

@@ -78,12 +78,12 @@ impl Avatar {
         partner.iter().enumerate().filter(|(i, j)| *i <= **j).map(|(i, j)| ordered(i, *j)).collect()
     }
 
-    /// Canonical centre, metres.
+    /// Returns the canonical centre, metres.
     fn center(&self, i: usize) -> Vec3 {
         self.places[i] + Vec3::from_slice(&self.parameters.offset[i])
     }
 
-    /// Opacity times the area along the two larger axes, square metres.
+    /// Returns opacity times the area along the two larger axes, square metres.
     fn weight(&self, i: usize) -> f32 {
         let [x, y, z, logit] = self.parameters.shape[i];
         let area = (x + y + z - x.min(y).min(z)).exp();

@@ -32,7 +32,7 @@ struct View<'a> {
     linear: &'a [f32],
     picture: &'a [u32],
     canonical: &'a [[f32; 4]],
-    drawn: &'a [[f32; 4]],
+    rendered: &'a [[f32; 4]],
 }
 
 /// Samples of a view's images at one position.
@@ -56,13 +56,13 @@ pub(super) fn observe(
     let posed = view.gaussians.unwrap_or(gaussians);
     let (Some(center_scale), Some(normal)) = (posed.center_scale.slice(), posed.normal.slice()) else { return };
     let (Some(positions), Some(last)) = (gaussians.canonical.slice(), gaussians.color.slice()) else { return };
-    let (Some(picture), Some(canonical), Some(drawn)) =
-        (view.picture.slice(), view.canonical.slice(), view.drawn.slice())
+    let (Some(picture), Some(canonical), Some(rendered)) =
+        (view.picture.slice(), view.canonical.slice(), view.rendered.slice())
     else {
         return;
     };
-    let (picture, canonical, drawn) = (picture.as_slice(), canonical.as_slice(), drawn.as_slice());
-    let view = View { camera: CameraConstants::from(view.camera), settings, linear, picture, canonical, drawn };
+    let (picture, canonical, rendered) = (picture.as_slice(), canonical.as_slice(), rendered.as_slice());
+    let view = View { camera: CameraConstants::from(view.camera), settings, linear, picture, canonical, rendered };
     let mut kept: Vec<&mut [[f32; 4]]> = kept.chunks_mut(CHUNK).collect();
     kept.resize_with(seen.len().div_ceil(CHUNK), Default::default);
     let outs = seen.par_chunks_mut(CHUNK).zip(quality.par_chunks_mut(CHUNK));
@@ -89,7 +89,7 @@ pub(super) fn observe(
 }
 
 impl View<'_> {
-    /// Observation by one view: pixel, colour, weight of Eq. 6 with exp(-k d), and weight in the sum.
+    /// Observes a Gaussian in one view: pixel, colour, weight of Eq. 6 with exp(-k d), and weight in the sum.
     #[inline]
     fn observe(
         &self,
@@ -145,7 +145,7 @@ impl View<'_> {
             color += belief * Vec3::new(channel(red), channel(green), channel(blue));
             coverage += belief;
             rendered += share * Vec4::from(self.canonical[index]);
-            shown += share * Vec4::from(self.drawn[index]);
+            shown += share * Vec4::from(self.rendered[index]);
         }
         let is_enough = coverage >= MIN_COVERAGE;
         is_enough.then(|| Sample { pixel, color: color / coverage, coverage, rendered, shown })

@@ -17,7 +17,7 @@ pub struct ViewInput<'a> {
     pub canonical: &'a StorageBuffer<[f32; 4]>,
     /// Colours of the last update seen from this camera: [`RenderTarget::color`](crate::RenderTarget) of the same
     /// rendering.
-    pub drawn: &'a StorageBuffer<[f32; 4]>,
+    pub rendered: &'a StorageBuffer<[f32; 4]>,
     /// Gaussians posed at this image's time, where that differs from the frame's.
     pub gaussians: Option<&'a GaussianBuffers>,
 }

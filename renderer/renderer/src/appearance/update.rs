@@ -157,7 +157,7 @@ impl DirectAppearance {
                     self.seen.raw().as_entire_binding(),
                     self.quality.raw().as_entire_binding(),
                     self.linear_from_srgb.raw().as_entire_binding(),
-                    view.drawn.raw().as_entire_binding(),
+                    view.rendered.raw().as_entire_binding(),
                     gaussians.color.raw().as_entire_binding(),
                     kept.raw().as_entire_binding(),
                 ];
@@ -287,7 +287,7 @@ impl DirectAppearance {
             let inputs = [
                 ("the image", "pixels", pixels, view.picture.len()),
                 ("the canonical map", "pixels", pixels, view.canonical.len()),
-                ("the drawn image", "pixels", pixels, view.drawn.len()),
+                ("the rendered image", "pixels", pixels, view.rendered.len()),
             ];
             for (what, unit, needed, found) in inputs {
                 if needed != found {

@@ -9,7 +9,7 @@ pub enum BackwardError {
     #[error(transparent)]
     Gpu(#[from] GpuError),
     /// A buffer does not fit the image rendered last.
-    #[error("{what}: {found} elements where the image drawn last needs {needed}; make it for that image")]
+    #[error("{what}: {found} elements where the image rendered last needs {needed}; make it for that image")]
     Buffer {
         /// Name of the buffer.
         what: &'static str,

@@ -47,17 +47,17 @@ impl ProcessorBackward {
         incoming: &ImageGradients,
         to: GradientTarget<'_>,
     ) {
-        let Some(drawn) = &rasterizer.latest else { return };
+        let Some(rendered) = &rasterizer.latest else { return };
         match to {
             GradientTarget::Isotropic { gaussians, carry, out } => {
                 let Some(color) = gaussians.color.slice() else { return };
                 if self.sum(rasterizer, (target, incoming, false), &color).is_some() {
-                    self.add_isotropic(drawn, gaussians, carry, out);
+                    self.add_isotropic(rendered, gaussians, carry, out);
                 }
             }
             GradientTarget::Anisotropic { gaussians, out } => {
                 if self.sum(rasterizer, (target, incoming, true), &rasterizer.lists.painted).is_some() {
-                    self.add_anisotropic(drawn, gaussians, out);
+                    self.add_anisotropic(rendered, gaussians, out);
                 }
             }
         }
@@ -70,13 +70,13 @@ impl ProcessorBackward {
         (target, incoming, carries_color): (&RenderTarget, &ImageGradients, bool),
         color: &[[f32; 4]],
     ) -> Option<()> {
-        let ProcessorRasterizer { lists, latest: Some(drawn), .. } = rasterizer else { return None };
+        let ProcessorRasterizer { lists, latest: Some(rendered), .. } = rasterizer else { return None };
         let (drawn_color, drawn_depth) = (target.color.slice()?, target.depth.slice()?);
         let (d_color, d_depth) = (incoming.color.slice()?, incoming.depth_carry.slice()?);
         let pixels = Pixels {
-            size: drawn.size.map(|side| side as usize),
+            size: rendered.size.map(|side| side as usize),
             color: &drawn_color,
-            depth: drawn.settings.outputs.depth.then_some(&drawn_depth),
+            depth: rendered.settings.outputs.depth.then_some(&drawn_depth),
             d_color: &d_color,
             d_depth: &d_depth,
             carries_color,
@@ -95,10 +95,10 @@ impl ProcessorBackward {
             rest = others;
         }
         let within = |first: u32, count: u32, at: usize| (first as usize..(first + count) as usize).contains(&at);
-        bands.into_par_iter().filter(|(row, ..)| within(drawn.first_tile[1], drawn.blended[1], *row)).for_each(
+        bands.into_par_iter().filter(|(row, ..)| within(rendered.first_tile[1], rendered.blended[1], *row)).for_each(
             |(row, first, part, walked)| {
                 for (column, walked) in walked.iter_mut().enumerate() {
-                    if !within(drawn.first_tile[0], drawn.blended[0], column) {
+                    if !within(rendered.first_tile[0], rendered.blended[0], column) {
                         continue;
                     }
                     let Some(state) = pixels.state(column, row) else { continue };
@@ -115,9 +115,9 @@ impl ProcessorBackward {
             },
         );
         self.sums.clear();
-        self.sums.resize(drawn.gaussians, [0.0; 11]);
+        self.sums.resize(rendered.gaussians, [0.0; 11]);
         self.is_touched.clear();
-        self.is_touched.resize(drawn.gaussians, false);
+        self.is_touched.resize(rendered.gaussians, false);
         for (tile, &walked) in self.walked.iter().enumerate().filter(|(_, walked)| **walked > 0) {
             let range = lists.range(tile);
             let range = range.start..range.start + walked as usize;
@@ -131,7 +131,13 @@ impl ProcessorBackward {
     }
 
     /// Carries the sums to isotropic Gaussians.
-    fn add_isotropic(&self, drawn: &RasterImage, gaussians: &GaussianBuffers, carry: Carry, out: &GaussianGradients) {
+    fn add_isotropic(
+        &self,
+        rendered: &RasterImage,
+        gaussians: &GaussianBuffers,
+        carry: Carry,
+        out: &GaussianGradients,
+    ) {
         let Some(center_scale) = gaussians.center_scale.slice() else { return };
         let (Some(mut center), Some(mut carried)) = (out.center.slice_mut(), out.carried.slice_mut()) else { return };
         let outs = center.par_chunks_mut(CHUNK).zip(carried.par_chunks_mut(2 * CHUNK));
@@ -142,14 +148,14 @@ impl ProcessorBackward {
                 for (((center, carried), sums), center_scale) in
                     gaussians.zip(is_touched).filter(|(_, is_touched)| **is_touched).map(|(one, _)| one)
                 {
-                    add_isotropic(drawn, sums, center_scale, carry, center, carried);
+                    add_isotropic(rendered, sums, center_scale, carry, center, carried);
                 }
             },
         );
     }
 
     /// Carries the sums to anisotropic Gaussians.
-    fn add_anisotropic(&self, drawn: &RasterImage, gaussians: &AnisotropicBuffers, out: &AnisotropicGradients) {
+    fn add_anisotropic(&self, rendered: &RasterImage, gaussians: &AnisotropicBuffers, out: &AnisotropicGradients) {
         let slices = gaussians.attributes().map(flyrig_gpu::StorageBuffer::slice);
         let [Some(center), Some(scale_opacity), Some(rotation), Some(harmonics)] = &slices else { return };
         let slices = out.attributes().map(flyrig_gpu::StorageBuffer::slice_mut);
@@ -158,7 +164,7 @@ impl ProcessorBackward {
             return;
         };
         let coefficients = gaussians.order().coefficients();
-        let colors = Harmonics { center, harmonics, coefficients, eye: drawn.camera.center() };
+        let colors = Harmonics { center, harmonics, coefficients, eye: rendered.camera.center() };
         let shapes = center_out.par_chunks_mut(CHUNK).zip(scale_out.par_chunks_mut(CHUNK));
         let outs =
             shapes.zip(rotation_out.par_chunks_mut(CHUNK)).zip(harmonics_out.par_chunks_mut(CHUNK * coefficients));
@@ -169,7 +175,7 @@ impl ProcessorBackward {
                     let (sums, i) = (&ins.0[at], chunk * CHUNK + at);
                     let Some(shape) = Shape::new(&scale_opacity[i], &rotation[i]) else { continue };
                     let out = [&mut center_out[at], &mut scale_out[at], &mut rotation_out[at]];
-                    add_anisotropic(drawn, sums, &center[i], &shape, out);
+                    add_anisotropic(rendered, sums, &center[i], &shape, out);
                     let harmonics_out = &mut harmonics_out[at * coefficients..(at + 1) * coefficients];
                     let d_color = Vec3::new(sums[8], sums[9], sums[10]);
                     colors.add_backward(i, d_color, &mut center_out[at], harmonics_out);
@@ -240,9 +246,9 @@ impl Pixels<'_> {
                     }
                     state.passing[y][x] = d_color[3] * (1.0 - seen[3]);
                     state.behind[y][x] = color.truncate().dot(Vec4::from(seen).truncate());
-                    if let Some(drawn) = self.depth {
+                    if let Some(rendered) = self.depth {
                         state.by_depth[y][x] = d_depth[0] / seen[3].max(1e-6);
-                        state.mean_depth[y][x] = drawn[at];
+                        state.mean_depth[y][x] = rendered[at];
                     }
                 }
             }

@@ -108,7 +108,7 @@ impl BackwardRasterizer {
         let pixels = latest.size[0] as usize * latest.size[1] as usize;
         check("dL/d colour", incoming.color.len(), pixels)?;
         check("dL/d depth", incoming.depth_carry.len(), pixels)?;
-        check("the drawn image", target.color.len().min(target.depth.len()), pixels)?;
+        check("the rendered image", target.color.len().min(target.depth.len()), pixels)?;
         to.check(&latest)?;
         match (&mut self.on, &rasterizer.on) {
             (BackwardOn::Device(device), RasterizerOn::Device(rasterizer)) => {

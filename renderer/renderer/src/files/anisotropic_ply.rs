@@ -55,6 +55,24 @@ pub fn write_anisotropic_ply(path: &Path, splats: &AnisotropicSplats) -> Result<
 ///
 /// # Errors
 /// [`PlyError`].
+///
+/// # Examples
+/// ```
+/// use flyrig_renderer::{AnisotropicSplats, HarmonicOrder, parse_anisotropic_ply, write_anisotropic_ply};
+///
+/// let mut splats = AnisotropicSplats::empty(HarmonicOrder::Zero);
+/// splats.center.push([0.0, 1.5, 0.0, 0.0]);
+/// splats.scale_opacity.push([0.01, 0.01, 0.002, 0.9]);
+/// splats.rotation.push([0.0, 0.0, 0.0, 1.0]);
+/// splats.harmonics.push([1.0, 0.5, 0.0, 0.0]);
+///
+/// let folder = tempfile::tempdir()?;
+/// let path = folder.path().join("one.ply");
+/// assert_eq!(write_anisotropic_ply(&path, &splats)?, 1);
+/// let read = parse_anisotropic_ply(&std::fs::read(&path)?)?;
+/// assert_eq!((read.count(), read.order), (1, HarmonicOrder::Zero));
+/// # Ok::<(), Box<dyn std::error::Error>>(())
+/// ```
 pub fn parse_anisotropic_ply(bytes: &[u8]) -> Result<AnisotropicSplats, PlyError> {
     let header = Header::parse(bytes)?;
     let width = header.properties.len() * size_of::<f32>();

@@ -79,6 +79,28 @@ struct LossKernels {
 }
 
 /// Comparison of images on the device. Sums run in a fixed order: equal input gives equal bytes on one device.
+///
+/// # Examples
+/// ```
+/// use flyrig_gpu::{AdapterChoice, GpuContext, StorageBuffer};
+/// use flyrig_renderer::{ImageGradients, ImageLoss, LossSettings, RenderTarget, WantedImage};
+///
+/// let gpu = GpuContext::new(&AdapterChoice::Best)?.on_processor();
+/// let settings = LossSettings { color_weight: 1.0, mask_weight: 1.0, area: [0, 0, 4, 4], with_unknown: false };
+/// let mut loss = ImageLoss::new(&gpu)?;
+/// loss.reserve(&gpu, 1)?;
+/// // An opaque black person in every pixel, compared with an empty rendering.
+/// let image = StorageBuffer::from_slice(&gpu, "image", &[u32::from_le_bytes([0, 0, 0, 255]); 16])?;
+/// let wanted = WantedImage::zeroed(&gpu, [4, 4], 0)?;
+/// let (rendered, slopes) = (RenderTarget::new(&gpu, 4, 4)?, ImageGradients::zeroed(&gpu, 4, 4)?);
+///
+/// let mut encoder = gpu.device.create_command_encoder(&Default::default());
+/// loss.prepare(&gpu, &mut encoder, &wanted, &image, &settings);
+/// loss.encode(&gpu, &mut encoder, 0, &rendered, &wanted, &settings, &slopes);
+/// gpu.queue.submit([encoder.finish()]);
+/// assert_eq!(loss.read(&gpu, 1)?[0].mask, 16.0);
+/// # Ok::<(), flyrig_gpu::GpuError>(())
+/// ```
 #[derive(Debug)]
 pub struct ImageLoss {
     /// `None` on the processor.
@@ -154,13 +176,13 @@ impl ImageLoss {
         gpu: &GpuContext,
         encoder: &mut CommandEncoder,
         index: usize,
-        drawn: &RenderTarget,
+        rendered: &RenderTarget,
         wanted: &WantedImage,
         settings: &LossSettings,
         out: &ImageGradients,
     ) {
         let pixels = wanted.width as usize * wanted.height as usize;
-        let fits = (drawn.width, drawn.height) == (wanted.width, wanted.height)
+        let fits = (rendered.width, rendered.height) == (wanted.width, wanted.height)
             && out.color.len().min(out.depth_carry.len()) >= pixels
             && self.sums.len() >= (index + 1).saturating_mul(SUMS as usize);
         let sums_at = index as u64 * u64::from(SUMS) * 16;
@@ -172,7 +194,7 @@ impl ImageLoss {
         }
         let Some((constants, groups)) = constants(wanted, index as u32, settings).filter(|_| fits) else { return };
         let Some(LossKernels { compare, add_up, .. }) = &self.kernels else {
-            return processor::compare(&constants, &wanted.color, &drawn.color, out, &self.sums);
+            return processor::compare(&constants, &wanted.color, &rendered.color, out, &self.sums);
         };
         wanted.constants.encode(gpu, encoder, &[bytes_of(&constants)]);
         let mut pass =
@@ -181,7 +203,7 @@ impl ImageLoss {
         let resources = [
             (0, wanted.constants.get(0)),
             (3, wanted.color.raw().as_entire_binding()),
-            (4, drawn.color.raw().as_entire_binding()),
+            (4, rendered.color.raw().as_entire_binding()),
             (5, out.color.raw().as_entire_binding()),
             (6, out.depth_carry.raw().as_entire_binding()),
             (7, partials.clone()),

@@ -46,11 +46,13 @@ pub(super) fn unpack(
 pub(super) fn compare(
     loss: &LossConstants,
     wanted: &StorageBuffer<[f32; 4]>,
-    drawn: &StorageBuffer<[f32; 4]>,
+    rendered: &StorageBuffer<[f32; 4]>,
     out: &ImageGradients,
     sums: &StorageBuffer<[f32; 4]>,
 ) {
-    let (Some(wanted), Some(drawn), Some(mut sums)) = (wanted.slice(), drawn.slice(), sums.slice_mut()) else { return };
+    let (Some(wanted), Some(rendered), Some(mut sums)) = (wanted.slice(), rendered.slice(), sums.slice_mut()) else {
+        return;
+    };
     let (Some(mut d_color), Some(mut d_carry)) = (out.color.slice_mut(), out.depth_carry.slice_mut()) else { return };
     let width = loss.size[0] as usize;
     let [left, top] = loss.first.map(|side| side as usize);
@@ -69,7 +71,7 @@ pub(super) fn compare(
                     (*d_color, *d_carry) = ([0.0; 4], [0.0; 4]);
                     continue;
                 }
-                let off = Vec4::from(drawn[at]) - goal;
+                let off = Vec4::from(rendered[at]) - goal;
                 let squared = off.truncate().length_squared();
                 sums[0] += loss.color_weight * squared + loss.mask_weight * off.w * off.w;
                 sums[1] += off.w * off.w;
@@ -78,8 +80,9 @@ pub(super) fn compare(
                 *d_color = (along * off).to_array();
                 *d_carry = [0.0; 4];
                 if x > left && y > top && x < right && y < bottom {
-                    let slope =
-                        |after: usize, before: usize| 0.5 * (Vec4::from(drawn[after]) - Vec4::from(drawn[before]));
+                    let slope = |after: usize, before: usize| {
+                        0.5 * (Vec4::from(rendered[after]) - Vec4::from(rendered[before]))
+                    };
                     let (dx, dy) = (slope(at + 1, at - 1), slope(at + width, at - width));
                     *d_carry = [0.0, (along * dx).dot(dx), (along * dx).dot(dy), (along * dy).dot(dy)];
                 }

@@ -13,9 +13,9 @@ use crate::raster::processor::rasterizer::ProcessorRasterizer;
 use crate::raster::settings::Latest;
 use crate::raster::settings::{RasterSettings, RasterStats};
 
-/// Draws Gaussians into images: projection through the camera's lens (EWA splatting), stable
-/// sort by depth, lists by tile, and front-to-back blending, all on the device without a wait, or on the processor when the
-/// image is recorded.
+/// Rasteriser of Gaussians into images: projection through the camera's lens (EWA splatting), stable sort by depth,
+/// lists by tile, and front-to-back blending, all on the device without a wait, or on the processor when the image is
+/// recorded.
 ///
 /// - Gaussians are ordered by the depth of their centres, to 24 bits of the range of the depths as floats; equal depths
 ///   keep the order of the buffers. Equal input gives equal bytes on one device.
@@ -25,6 +25,39 @@ use crate::raster::settings::{RasterSettings, RasterStats};
 ///   1e9 m, or outside the lens's valid radius is not drawn.
 /// - [`AnisotropicBuffers`](crate::AnisotropicBuffers) share all steps after projection and colouring.
 /// - Buffers and pipelines are created once and grow with the image and the number of Gaussians.
+///
+/// # Examples
+/// ```
+/// use flyrig_gpu::{AdapterChoice, GpuContext};
+/// use flyrig_renderer::{GaussianBuffers, RasterSettings, Rasterizer, RenderTarget};
+/// use flyrig_types::{Camera, ColorMatch, Intrinsics, Isometry};
+/// use glam::DVec3;
+///
+/// let gpu = GpuContext::new(&AdapterChoice::Best)?.on_processor();
+/// // A red Gaussian of 10 cm at the origin that faces the camera.
+/// let gaussians = GaussianBuffers::zeroed(&gpu, 1)?;
+/// gaussians.center_scale.write(&gpu, &[[0.0, 0.0, 0.0, 0.1]]);
+/// gaussians.normal.write(&gpu, &[[0.0, -1.0, 0.0, 0.0]]);
+/// gaussians.color.write(&gpu, &[[1.0, 0.0, 0.0, 1.0]]);
+/// let camera = Camera {
+///     id: "front".into(),
+///     intrinsics: Intrinsics::pinhole(65, 65, 100.0),
+///     camera_from_world: Isometry::look_at(DVec3::new(0.0, -2.0, 0.0), DVec3::ZERO, DVec3::Z),
+///     time_offset_nanos: 0,
+///     color: ColorMatch::NONE,
+/// };
+///
+/// let mut rasterizer = Rasterizer::new(&gpu, gaussians.count())?;
+/// let target = RenderTarget::new(&gpu, 65, 65)?;
+/// let mut encoder = gpu.device.create_command_encoder(&Default::default());
+/// rasterizer.encode(&gpu, &mut encoder, &gaussians, &camera, &RasterSettings::default(), &target)?;
+/// gpu.queue.submit([encoder.finish()]);
+///
+/// let [red, _, _, alpha] = target.color.read(&gpu)?[65 * 32 + 32];
+/// assert!(red > 0.9 && alpha > 0.9);
+/// assert!((target.depth.read(&gpu)?[65 * 32 + 32] - 2.0).abs() < 1e-3);
+/// # Ok::<(), flyrig_gpu::GpuError>(())
+/// ```
 #[derive(Debug)]
 pub struct Rasterizer {
     pub(crate) on: RasterizerOn,

@@ -16,7 +16,7 @@ pub(super) type PairSum = [f32; 11];
 
 /// Carries an isotropic Gaussian's sums through the filtered ellipse, the lens and the camera to the world.
 pub(super) fn add_isotropic(
-    drawn: &RasterImage,
+    rendered: &RasterImage,
     sums: &PairSum,
     center_scale: &[f32; 4],
     carry: Carry,
@@ -26,9 +26,9 @@ pub(super) fn add_isotropic(
     let [.., weight, a, b, c] = *sums;
     let carried = [a, b, c];
     let [x, y, z, scale] = *center_scale;
-    let view = ProjectedPoint::new(&drawn.camera, Vec3::new(x, y, z));
+    let view = ProjectedPoint::new(&rendered.camera, Vec3::new(x, y, z));
     let rows = rows_of(&view.jacobian).map(|row| row * scale);
-    let (d_pixel, d_covariance) = through_ellipse(drawn, sums, rows);
+    let (d_pixel, d_covariance) = through_ellipse(rendered, sums, rows);
     // Covariance = scale^2 J J^T.
     let twice = d_covariance * (2.0 * scale * scale);
     let in_world = view.to_world(d_pixel, view.jacobian.map(|column| twice * column), sums[3]);
@@ -54,17 +54,17 @@ pub(super) fn add_isotropic(
 
 /// Carries an anisotropic Gaussian's sums to its centre, its scales and opacity, and its rotation.
 pub(super) fn add_anisotropic(
-    drawn: &RasterImage,
+    rendered: &RasterImage,
     sums: &PairSum,
     center: &[f32; 4],
     shape: &Shape,
     [center_out, scale_out, rotation_out]: [&mut [f32; 4]; 3],
 ) {
-    let view = ProjectedPoint::new(&drawn.camera, Vec4::from(*center).truncate());
-    let axes = shape.axes_in_camera(&drawn.camera);
+    let view = ProjectedPoint::new(&rendered.camera, Vec4::from(*center).truncate());
+    let axes = shape.axes_in_camera(&rendered.camera);
     let along_axes = rows_along(&view.jacobian, &axes);
     let rows = along_axes.map(|row| row * shape.scale_m);
-    let (d_pixel, d_covariance) = through_ellipse(drawn, sums, rows);
+    let (d_pixel, d_covariance) = through_ellipse(rendered, sums, rows);
     // Covariance = M M^T with M = J A and A = axes * scales; dL/dM = `d_rows` by columns, dL/dJ = dL/dM A^T.
     let columns = |rows: [Vec3; 2]| [0, 1, 2].map(|k| Vec2::new(rows[0][k], rows[1][k]));
     let d_rows = columns(rows).map(|column| d_covariance * column * 2.0);
@@ -99,11 +99,11 @@ fn add(out: &mut [f32; 4], more: Vec4) {
 
 /// Returns dL/d pixel and dL/d covariance before the filter, whose matrix root has these rows: through the conic, and
 /// through the opacity sqrt(det / filtered_det).
-fn through_ellipse(drawn: &RasterImage, sums: &PairSum, [row_x, row_y]: [Vec3; 2]) -> (Vec2, Mat2) {
+fn through_ellipse(rendered: &RasterImage, sums: &PairSum, [row_x, row_y]: [Vec3; 2]) -> (Vec2, Mat2) {
     let [slope, slope_x, slope_y, _, xx_moment, xy_moment, yy_moment, ..] = *sums;
     let (xx, xy, yy) = (row_x.dot(row_x), row_x.dot(row_y), row_y.dot(row_y));
     let det = row_x.cross(row_y).length_squared();
-    let s = drawn.settings.filter_variance_px2;
+    let s = rendered.settings.filter_variance_px2;
     let filtered_det = det + s * (xx + yy) + s * s;
     // Inverse covariances after and before the filter.
     let filtered_inverse = Mat2::from_cols_array(&[yy + s, -xy, -xy, xx + s]) * (1.0 / filtered_det);
