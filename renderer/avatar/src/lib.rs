@@ -4,6 +4,12 @@
 //! colour in canonical space ([`GaussianParameters`]). [`Avatar::pose`] transforms them to the world by linear blend
 //! skinning, with or without a deformation graph's translations; [`Fit`] optimises them by gradient descent on images,
 //! directly or as outputs of local networks ([`Fit::use_networks`]).
+//!
+//! - `model`: attributes, posing, the room's light, files, rendering with fewer Gaussians in small images, and the surface and colours as the
+//!   start of live tracking.
+//! - `fit`: gradient descent with corrections of poses and skin weights, on crops without the mixed colours of the outline; its state
+//!   between steps.
+//! - `local`: LoGAvatar's local networks. `edit`: texture and shape.
 
 mod edit;
 mod error;

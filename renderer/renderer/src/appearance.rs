@@ -1,6 +1,6 @@
-//! Colours without learned weights: FlyHuman section 3.2 (Eq. 5 to 12) with linear RGB as the feature.
+//! Direct appearance, colours without learned weights: FlyHuman section 3.2 (Eq. 5 to 12) with linear RGB as the feature.
 //!
-//! Four kernels, on the device without a round trip or on the processor (`appearance/processor.rs`):
+//! Four kernels, on the device without a round trip or on the processor (`processor.rs`):
 //!
 //! 1. **observe** (a thread a Gaussian, a dispatch a view): projects the point of the drawn surface above
 //!    the centre (w of the normals) with the camera's own lens, samples the image

@@ -1,4 +1,16 @@
-//! Splats to images and back: forward and backward rasteriser, direct appearance, splat files.
+//! Gaussians to images and back: forward and backward rasteriser, direct appearance, image loss, splat files.
+//!
+//! Every kernel exists twice: as WGSL for a device and as a native twin (`processor.rs` or `processor/` beside it), which computes
+//! while it is recorded. A [`GpuContext`](flyrig_gpu::GpuContext) decides which one runs; callers do not notice, provided that they record
+//! copies and clears through [`StorageBuffer`](flyrig_gpu::StorageBuffer) and never through its raw buffer. Tests run both against one f64
+//! reference.
+//!
+//! - `raster`, `backward`, `anisotropic`: the rasteriser, its derivative, and Gaussians of three scales with colours by direction.
+//! - `sort`: radix sort and prefix sum on the device.
+//! - `appearance`: colours from the images of an instant. `image_loss`: comparison of images for the deformation.
+//! - `files`: PLY files. `browser_kernels`: the WGSL for pages with WebGPU.
+//!
+//! Equal input gives equal bytes on one device: no kernel uses atomics on floats, and every sum has a fixed order.
 
 mod anisotropic;
 mod appearance;

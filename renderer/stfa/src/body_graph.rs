@@ -27,7 +27,7 @@ const MIN_POOL_WEIGHT: f32 = 0.25;
 /// let surface = sample_surface(&template, 2000, 1)?;
 /// let graph = build_graph(&template, &surface, 100, DEFAULT_SIGMA2_M2)?;
 /// let body = BodyGraph::new(&surface, &graph)?;
-/// assert_eq!((body.gaussians(), body.nodes()), (2000, graph.nodes.len()));
+/// assert_eq!((body.gaussians(), body.nodes()), (surface.len(), graph.nodes.len()));
 /// // The same weights serve every body.
 /// let networks = LearnedAppearance::new(&Parameters::named("tiny".as_ref())?, body);
 /// assert_eq!(networks.counts.views_encoded, 0);

@@ -96,7 +96,7 @@ impl Attachment {
 /// pose.root_translation.x += 1.0;
 /// let mut posed = PosedAvatar::default();
 /// avatar.pose(&Bones::new(&template.skeleton, &pose), None, &mut posed);
-/// assert_eq!(posed.center.len(), 500);
+/// assert_eq!(posed.center.len(), surface.len());
 /// # Ok::<(), Box<dyn std::error::Error>>(())
 /// ```
 #[derive(Debug, Clone, PartialEq)]
