@@ -8,14 +8,13 @@ ifndef XDG_RUNTIME_DIR
 export NODEVICE_SELECT = 1
 endif
 
-.PHONY: help setup demo test test-long test-v4l2 test-gpu-networks test-browser soak fuzz check
+.PHONY: help setup demo test test-long test-v4l2 test-browser soak fuzz check
 
 help:
 	@echo "make demo    install what is missing, build, run the simulated rig, show the report (OUT=$(OUT))"
 	@echo "make test    install what is missing, build, run every test"
 	@echo "make test-long  the long stability runs"
 	@echo "make test-v4l2  camera capture against the kernel's test drivers, in an emulated machine"
-	@echo "make test-gpu-networks  networks on the graphics adapter (about twenty processor minutes more to build)"
 	@echo "make test-browser  the web page in Chromium, which it installs"
 	@echo "make soak    four plain cameras for MINUTES (30): memory, latency, processor time"
 	@echo "make fuzz    damaged input for everything that reads foreign bytes, MINUTES (30) for each"
@@ -38,10 +37,6 @@ test-long: setup
 
 test-v4l2: setup
 	@scripts/test-v4l2.sh
-
-test-gpu-networks: setup
-	$(CARGO) clippy --release --locked -p flyrig-stfa --features wgpu --all-targets -- -D warnings
-	$(CARGO) test --release --locked -p flyrig-stfa --features wgpu
 
 test-browser: setup
 	@scripts/setup.sh chromium

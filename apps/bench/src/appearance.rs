@@ -89,12 +89,8 @@ fn run(
 ) -> Result<Row> {
     let rig = sequence.inputs(views);
     let perception = GivenPerception::repeating(&rig, sequence.template.clone(), sequence.track.clone());
-    let appearance = AppearanceOptions {
-        mode: mode.mode,
-        weights: mode.networks.map(|(_, weights)| weights.to_owned()),
-        reuse: args.reuse,
-        networks_on: args.networks_on,
-    };
+    let appearance =
+        AppearanceOptions { mode: mode.mode, weights: mode.networks.map(|(_, weights)| weights.to_owned()) };
     let body = BodySettings::with_gaussians(args.gaussians);
     let settings = SessionSettings { body, appearance, ..SessionSettings::default() };
     let mut session = SessionBuilder::new(gpu.clone(), rig).settings(settings).perception(perception).build()?;

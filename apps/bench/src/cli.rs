@@ -7,7 +7,7 @@ use std::{
 
 use clap::{Args, Parser, Subcommand, builder::TypedValueParser as _};
 use flyrig_body::DEFAULT_GAUSSIAN_COUNT;
-use flyrig_fusion::{BodySettings, BudgetSettings, NetworksOn, Origin, PerceptionSettings, SessionSettings};
+use flyrig_fusion::{BodySettings, BudgetSettings, Origin, PerceptionSettings, SessionSettings};
 use flyrig_report::{
     ReplaySettings,
     arguments::{parse_fps, parse_minutes, parse_range, parse_seconds, parse_size},
@@ -92,12 +92,6 @@ pub struct BenchAppearanceArgs {
     /// Weights files of the learned modes, in place of all networks that come with flyrig; may be given several times.
     #[arg(long)]
     pub weights: Vec<PathBuf>,
-    /// Reuse of the networks' results from frame to frame: see `reuse` in the configuration.
-    #[arg(long, default_value_t = 0.0)]
-    pub reuse: f32,
-    /// Where the networks run; "adapter" needs a program that was built with the feature gpu-networks.
-    #[arg(long, value_enum, default_value = "processor")]
-    pub networks_on: NetworksOn,
     /// Pixels of an image's side.
     #[arg(long, default_value_t = 512, value_parser = clap::value_parser!(u32).range(64..=2048))]
     pub side: u32,

@@ -4,7 +4,7 @@ use std::path::PathBuf;
 
 use clap::{Args, ValueEnum, builder::TypedValueParser as _};
 use flyrig_body::DEFAULT_GAUSSIAN_COUNT;
-use flyrig_fusion::{NetworksOn, Origin};
+use flyrig_fusion::Origin;
 use flyrig_stfa::NetworkSize;
 
 /// Arguments of `flyrig train`.
@@ -62,9 +62,6 @@ pub struct TrainArgs {
     /// Weights file to start from in place of random weights; "small" or "tiny" for the networks that come with flyrig.
     #[arg(long)]
     pub from: Option<PathBuf>,
-    /// Where the networks are trained; "adapter" needs a flyrig that was built with the feature gpu-networks.
-    #[arg(long, value_enum, default_value = "processor")]
-    pub networks_on: NetworksOn,
     /// Checkpoints (one every 250 steps) from one measurement on the test people to the next.
     #[arg(long, default_value_t = 4, value_parser = clap::value_parser!(u64).range(1..=1000))]
     pub test_every: u64,

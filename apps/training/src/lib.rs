@@ -15,10 +15,9 @@ use std::{
 };
 
 use anyhow::{Context, Result, ensure};
-use flyrig_fusion::NetworksOn;
 use flyrig_gpu::GpuContext;
 use flyrig_report::{progress_bar, stop, write_whole};
-use flyrig_stfa::{NetworkDevice, Parameters, SampleErrors, TrainSettings, Trainer, TrainingSample, evaluate};
+use flyrig_stfa::{Parameters, SampleErrors, TrainSettings, Trainer, TrainingSample, evaluate};
 
 pub use self::arguments::{SizeName, TrainArgs};
 use self::{
@@ -40,10 +39,6 @@ pub fn train(args: &TrainArgs, gpu: &dyn Fn() -> Result<GpuContext>) -> Result<(
     let started = Instant::now();
     // What is asked for in vain is told before hours of simulation.
     let begin = begin(args)?;
-    let device = match args.networks_on {
-        NetworksOn::Processor => NetworkDevice::processor(),
-        NetworksOn::Adapter => NetworkDevice::adapter(&gpu()?)?,
-    };
     std::fs::create_dir_all(&args.out).with_context(|| format!("cannot create {}", args.out.display()))?;
     let people = People { seed: args.seed, instants: args.instants, side: args.side, gaussians: args.gaussians };
     let held_out = People { seed: args.seed.wrapping_add(HELD_OUT_SEED), ..people.clone() };
@@ -84,7 +79,6 @@ pub fn train(args: &TrainArgs, gpu: &dyn Fn() -> Result<GpuContext>) -> Result<(
     } else {
         Trainer::new(begin, settings)
     };
-    trainer.device = device;
     let mut progress = Progress::open(&args.out, trainer.step)?;
     let bar = progress_bar(args.steps, "train");
     bar.set_position(trainer.step);

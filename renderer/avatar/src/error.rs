@@ -1,4 +1,4 @@
-//! Reasons why there is no avatar.
+//! Errors of avatars.
 
 use std::path::PathBuf;
 
@@ -9,35 +9,35 @@ use flyrig_renderer::BackwardError;
 /// Reason why an avatar cannot be built, read or drawn.
 #[derive(Debug, thiserror::Error)]
 pub enum AvatarError {
-    /// The graphics adapter.
+    /// The graphics adapter reported an error.
     #[error(transparent)]
     Gpu(#[from] GpuError),
-    /// Derivatives.
+    /// Derivatives could not be recorded.
     #[error(transparent)]
     Backward(#[from] BackwardError),
-    /// The body.
+    /// The body is invalid.
     #[error(transparent)]
     Body(#[from] BodyError),
-    /// A file that cannot be read or written.
+    /// A file cannot be read or written.
     #[error("{path}: {source}")]
     File {
-        /// Which file.
+        /// Path of the file.
         path: PathBuf,
-        /// Why.
+        /// Reason given by the system.
         source: std::io::Error,
     },
-    /// A file that is no avatar, or a damaged one.
+    /// A file is no avatar, or damaged.
     #[error("{path}: {problem}")]
     Format {
-        /// Which file.
+        /// Path of the file.
         path: PathBuf,
         /// The fault, and how to fix it.
         problem: String,
     },
-    /// A texture that does not fit the avatar.
+    /// A texture does not fit the avatar.
     #[error("{0}")]
     Texture(String),
-    /// Nothing to learn from.
+    /// The images cannot be learned from.
     #[error("{0}")]
     Images(String),
 }

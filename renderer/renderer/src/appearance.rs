@@ -1,6 +1,6 @@
-//! Colours without learned weights: FlyHuman section 3.2 (Eq. 5 to 12) with linear RGB as the feature.
+//! Direct appearance, colours without learned weights: FlyHuman section 3.2 (Eq. 5 to 12) with linear RGB as the feature.
 //!
-//! Four kernels, on the device without a round trip or on the processor (`appearance/processor.rs`):
+//! Four kernels, on the device without a round trip or on the processor (`processor.rs`):
 //!
 //! 1. **observe** (a thread a Gaussian, a dispatch a view): projects the point of the drawn surface above
 //!    the centre (w of the normals) with the camera's own lens, samples the image
@@ -32,13 +32,10 @@
 //! - **No spatial aggregation**: the paper's baseline. A camera that has the point inside image and mask gets a
 //!   small extra weight, visible or not; the weights are normalised. Points inside no image are grey.
 
+pub(crate) mod color_means;
 mod graph_buffers;
-mod hierarchy;
+pub(crate) mod hierarchy;
 mod kernels;
 mod processor;
-mod settings;
-mod update;
-
-pub use hierarchy::{DiffusionHierarchy, DiffusionLevel};
-pub use settings::{AppearanceError, AppearanceSettings, ObservationBuffers, Observations, ViewInput};
-pub use update::DirectAppearance;
+pub(crate) mod settings;
+pub(crate) mod update;

@@ -1,28 +1,32 @@
-//! Kernels for programs that draw with them through another host than this crate: the web page does in browsers with WebGPU.
+//! Kernels for other hosts than this crate: the web page draws with them in browsers with WebGPU.
 
 use std::mem::offset_of;
 
-use crate::raster_buffers::{MIN_PAIRS, PAIRS_PER_GAUSSIAN, PAIRS_PER_TILE};
-use crate::raster_kernels::{BINS_LANES, Frame, Tile, bins_wgsl, blend_wgsl, project_anisotropic_wgsl, project_wgsl};
-use crate::scan::{SEGMENTS, scan_wgsl};
-use crate::sort::{BLOCK, DIGIT_BITS, KEY_BITS, sort_wgsl};
-use crate::{Outputs, RasterSettings};
+use crate::raster::buffers::{MIN_PAIRS, PAIRS_PER_GAUSSIAN, PAIRS_PER_TILE};
+use crate::raster::kernels::{
+    BINS_LANES, FrameConstants, Tile, bins_wgsl, blend_wgsl, project_anisotropic_wgsl, project_wgsl,
+};
+use crate::raster::settings::{Outputs, RasterSettings};
+use crate::sort::radix::{BLOCK, DIGIT_BITS, KEY_BITS, sort_wgsl};
+use crate::sort::scan::{SEGMENTS, scan_wgsl};
 
-/// WGSL and numbers for a host that draws Gaussians as [`crate::Rasterizer`] does on a device, colour and alpha only: isotropic ones, or
-/// anisotropic ones of one colour each, which the host hands to `blend` in place of what `raster_paint.wgsl` would write.
-/// Bindings and their order are those of `raster_device.rs`; no entry point binds more than 8 storage buffers.
+/// WGSL and constants for a host that draws colour and alpha of Gaussians as [`crate::Rasterizer`] does on a device:
+/// isotropic ones, or anisotropic ones of one colour each, which the host passes to `blend` in place of the output of
+/// `anisotropic/paint.wgsl`. Bindings and their order are those of `raster/device.rs`; no entry point binds more than 8
+/// storage buffers.
 #[derive(Debug, Clone)]
 pub struct BrowserKernels {
     /// Name and WGSL of each module, and of `srgb`, a function for the host's own modules.
     pub modules: [(&'static str, String); 7],
-    /// Name and value of the numbers that the host needs: workgroup sizes, room for pairs, settings of the drawing.
+    /// Name and value of the constants that the host needs: workgroup sizes, capacity for pairs, settings of the
+    /// rendering.
     pub numbers: [(&'static str, f64); 11],
     /// Name and byte offset of the fields of an image's constants, and their size. The matrix of the camera is first.
     pub frame: [(&'static str, usize); 13],
 }
 
 impl BrowserKernels {
-    /// Returns the kernels for graphics processors.
+    /// Generates the kernels for GPUs.
     #[must_use]
     pub fn new() -> Self {
         let tile = Tile::HARDWARE;
@@ -51,19 +55,19 @@ impl BrowserKernels {
                 ("nearM", settings.near_m.into()),
             ],
             frame: [
-                ("position", offset_of!(Frame, camera.position)),
-                ("focal", offset_of!(Frame, camera.focal_px)),
-                ("center", offset_of!(Frame, camera.center_px)),
-                ("cameraSize", offset_of!(Frame, camera.size)),
-                ("validRadius", offset_of!(Frame, camera.valid_radius)),
-                ("size", offset_of!(Frame, size)),
-                ("tiles", offset_of!(Frame, tiles)),
-                ("gaussians", offset_of!(Frame, gaussians)),
-                ("cullBackfacing", offset_of!(Frame, cull_backfacing)),
-                ("pairCapacity", offset_of!(Frame, pair_capacity)),
-                ("near", offset_of!(Frame, near_m)),
-                ("filterVariance", offset_of!(Frame, filter_variance_px2)),
-                ("bytes", size_of::<Frame>()),
+                ("position", offset_of!(FrameConstants, camera.position)),
+                ("focal", offset_of!(FrameConstants, camera.focal_px)),
+                ("center", offset_of!(FrameConstants, camera.center_px)),
+                ("cameraSize", offset_of!(FrameConstants, camera.size)),
+                ("validRadius", offset_of!(FrameConstants, camera.valid_radius)),
+                ("size", offset_of!(FrameConstants, size)),
+                ("tiles", offset_of!(FrameConstants, tiles)),
+                ("gaussians", offset_of!(FrameConstants, gaussians)),
+                ("cullBackfacing", offset_of!(FrameConstants, cull_backfacing)),
+                ("pairCapacity", offset_of!(FrameConstants, pair_capacity)),
+                ("near", offset_of!(FrameConstants, near_m)),
+                ("filterVariance", offset_of!(FrameConstants, filter_variance_px2)),
+                ("bytes", size_of::<FrameConstants>()),
             ],
         }
     }

@@ -1,16 +1,16 @@
-//! What the renderer's stages hand to each other on the GPU.
+//! Buffers that the renderer's stages pass to each other on the GPU.
 
 use flyrig_gpu::{GpuContext, GpuError, StorageBuffer};
 
 use crate::schema::{self, GaussianElement};
 
-/// The posed, coloured Gaussians of one instant; one element a Gaussian in every buffer, a buffer for each of
+/// Posed, coloured isotropic Gaussians of one instant; one element per Gaussian in every buffer, one buffer for each of
 /// [`GAUSSIAN_ATTRIBUTES`](crate::GAUSSIAN_ATTRIBUTES).
 #[derive(Debug)]
 pub struct GaussianBuffers {
     /// World position, metres; w: standard deviation of the isotropic Gaussian, metres.
     pub center_scale: StorageBuffer<GaussianElement>,
-    /// World unit normal of the surface; w: how far the centre lies below the surface that is drawn, metres.
+    /// World unit normal of the surface; w: depth of the centre below the drawn surface, metres.
     pub normal: StorageBuffer<GaussianElement>,
     /// Linear RGB; w: opacity in 0..=1.
     pub color: StorageBuffer<GaussianElement>,
@@ -19,7 +19,7 @@ pub struct GaussianBuffers {
 }
 
 impl GaussianBuffers {
-    /// Room for `count` Gaussians, all zero.
+    /// Allocates buffers for `count` Gaussians, all zero.
     ///
     /// # Errors
     /// [`GpuError::TooLarge`].
@@ -32,7 +32,7 @@ impl GaussianBuffers {
         })
     }
 
-    /// Centres and normals of their own, colours and canonical positions shared: the same person in another pose.
+    /// Creates another pose of the same person: own centres and normals, shared colours and canonical positions.
     ///
     /// # Errors
     /// [`GpuError::TooLarge`].
@@ -45,27 +45,28 @@ impl GaussianBuffers {
         })
     }
 
-    /// Records the copy of all Gaussians into `other`, from its element `first` on; what has no room there is left out.
+    /// Records the copy of all Gaussians into `other`, from its element `first` on; Gaussians beyond its end are
+    /// dropped.
     pub fn encode_copy(&self, encoder: &mut wgpu::CommandEncoder, other: &Self, first: usize) {
         for (from, to) in self.attributes().into_iter().zip(other.attributes()) {
             from.encode_copy(encoder, to, first);
         }
     }
 
-    /// The buffers in the order of [`GAUSSIAN_ATTRIBUTES`](crate::GAUSSIAN_ATTRIBUTES).
+    /// Returns the buffers in the order of [`GAUSSIAN_ATTRIBUTES`](crate::GAUSSIAN_ATTRIBUTES).
     #[must_use]
     pub fn attributes(&self) -> [&StorageBuffer<GaussianElement>; 4] {
         [&self.center_scale, &self.normal, &self.color, &self.canonical]
     }
 
-    /// Number of Gaussians.
+    /// Returns the number of Gaussians.
     #[must_use]
     pub fn count(&self) -> usize {
         self.center_scale.len()
     }
 }
 
-/// Images of one view, row by row, one element a pixel.
+/// Images of one view, row by row, one element per pixel.
 #[derive(Debug)]
 pub struct RenderTarget {
     /// Pixels.
@@ -74,14 +75,14 @@ pub struct RenderTarget {
     pub height: u32,
     /// Linear RGB times alpha; w: alpha (coverage).
     pub color: StorageBuffer<[f32; 4]>,
-    /// Mean camera-space z of what is seen, metres; 0 where alpha is 0.
+    /// Mean camera-space z of the visible Gaussians, metres; 0 where alpha is 0.
     pub depth: StorageBuffer<f32>,
     /// Canonical position times alpha, metres; w: alpha.
     pub canonical: StorageBuffer<[f32; 4]>,
 }
 
 impl RenderTarget {
-    /// Images of `width` x `height` pixels, all zero.
+    /// Allocates images of `width` x `height` pixels, all zero.
     ///
     /// # Errors
     /// [`GpuError::TooLarge`].
@@ -90,7 +91,7 @@ impl RenderTarget {
         Self::with_room(gpu, [width, height], pixels)
     }
 
-    /// A target of colour alone: its depth and canonical positions are empty, and must not be among the
+    /// Allocates a target for colour alone: depth and canonical positions are empty and must not be among the
     /// [`Outputs`](crate::Outputs).
     ///
     /// # Errors
@@ -99,7 +100,7 @@ impl RenderTarget {
         Self::with_room(gpu, [width, height], 0)
     }
 
-    /// Pixels of the largest target that the adapter can bind.
+    /// Returns the number of pixels of the largest target that the adapter can bind.
     #[must_use]
     pub fn max_pixels(gpu: &GpuContext) -> u64 {
         let limits = gpu.device.limits();

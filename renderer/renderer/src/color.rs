@@ -25,11 +25,19 @@ fn byte(value: f32) -> u8 {
     (value * 255.0 + 0.5) as u8
 }
 
-/// Straight-alpha sRGB (RGBA, 8 bits) of premultiplied linear colour, as in
+/// Converts premultiplied linear colour to straight-alpha sRGB (RGBA, 8 bits), as in
 /// [`RenderTarget::color`](crate::RenderTarget::color). Where alpha is 0 (or not finite) all four bytes are 0.
 ///
-/// The colour is un-premultiplied in linear light and then encoded, so multiplying the sRGB bytes by alpha gives
-/// the image on black as an ordinary 8-bit compositor (and our evaluation) makes it.
+/// The colour is un-premultiplied in linear light and then encoded, so that multiplying the sRGB bytes by alpha gives
+/// the image on black as an ordinary 8-bit compositor (and our evaluation) computes it.
+///
+/// # Examples
+/// ```
+/// use flyrig_renderer::rgba8_from_target;
+///
+/// // Half-covered white, premultiplied.
+/// assert_eq!(rgba8_from_target(&[[0.5, 0.5, 0.5, 0.5]]), [255, 255, 255, 128]);
+/// ```
 #[must_use]
 pub fn rgba8_from_target(color: &[[f32; 4]]) -> Vec<u8> {
     use rayon::prelude::*;
@@ -46,8 +54,8 @@ pub fn rgba8_from_target(color: &[[f32; 4]]) -> Vec<u8> {
     out
 }
 
-/// Straight-alpha RGBA over an RGB background, composited on the sRGB values as an 8-bit compositor does; RGB bytes.
-/// A background shorter than the image counts as black.
+/// Composites straight-alpha RGBA over an RGB background on the sRGB values, as an 8-bit compositor does; returns RGB
+/// bytes. A background shorter than the image counts as black.
 #[must_use]
 pub fn composite_over(rgba: &[u8], background_rgb: &[u8]) -> Vec<u8> {
     let mut out = vec![0; rgba.len() / 4 * 3];

@@ -1,11 +1,11 @@
-//! Colour corrections of cameras, pixel by pixel.
+//! Colour correction of camera images.
 
 use flyrig_types::{Camera, ColorMatch};
 use glam::DVec2;
 
-use crate::srgb_from_linear;
+use crate::color::srgb_from_linear;
 
-/// Entries of the table from light to bytes: steps of at most a quarter of a byte, in the shadows.
+/// Entries of the table from linear light to bytes: steps of at most a quarter of a byte, in the shadows.
 const CODES: usize = 1 << 14;
 
 /// Applies the [`ColorMatch`] of one camera to its images, from tables.
@@ -15,15 +15,15 @@ pub struct ColorMatcher {
     center: DVec2,
     /// 1 over the square of half the diagonal.
     scale: f64,
-    /// Light of each byte in the middle of the image, by channel.
+    /// Linear light of each byte in the middle of the image, per channel.
     light: [[f32; 256]; 3],
-    /// Bytes in the middle of the image, by channel.
+    /// Corrected bytes in the middle of the image, per channel.
     bytes: [[u8; 256]; 3],
     codes: Vec<u8>,
 }
 
 impl ColorMatcher {
-    /// Prepares the tables; `None` for a camera whose colours stay as they are.
+    /// Prepares the tables; `None` for a camera without a correction.
     #[must_use]
     pub fn new(camera: &Camera) -> Option<Self> {
         let of = camera.color;
@@ -48,13 +48,14 @@ impl ColorMatcher {
         })
     }
 
-    /// Whether the tables are those of the camera.
+    /// Returns whether the tables belong to the camera's correction.
     #[must_use]
     pub fn is_of(&self, camera: &Camera) -> bool {
         self.of == camera.color && self.center == camera.intrinsics.center_px
     }
 
-    /// Corrects the first three bytes of every pixel of `channels` bytes: sRGB, row by row. Pixels for which `skip` is true stay.
+    /// Corrects the first three bytes (sRGB) of every pixel of `channels` bytes, row by row. Pixels for which `skip` is
+    /// true are unchanged.
     pub fn correct(&self, pixels: &mut [u8], channels: usize, width: usize, skip: impl Fn(&[u8]) -> bool) {
         let has_falloff = self.of.falloff.iter().any(|share| share.abs() > 0.0);
         for (y, row) in pixels.chunks_exact_mut((channels * width).max(1)).enumerate() {

@@ -1,16 +1,17 @@
 //! Constants of one encoding.
 //!
-//! They lie in a storage buffer on purpose. Mesa's software adapter (22.3) specialises a shader anew for the values of
-//! a uniform buffer at every dispatch and never frees what it made: about 30 to 130 KiB a dispatch, for ever.
+//! They lie in a storage buffer because Mesa's software adapter (22.3) specialises shaders that branch on uniform
+//! buffers for their values at every dispatch and never frees the result: a leak of about 30 to 130 KiB per dispatch.
+//! Tests reject `var<uniform>`.
 
 use flyrig_gpu::{GpuContext, GpuError, StorageBuffer};
 use wgpu::{BindingResource, BufferBinding, BufferSize, CommandEncoder};
 
-/// Offsets in a storage buffer may be any multiple of this on every adapter (WebGPU's default limit).
+/// Alignment of binding offsets that every adapter supports (WebGPU's default limit), bytes.
 const ALIGNMENT: usize = 256;
 
 /// Several constants in one buffer. Each encoding records their upload among its own commands: a queued write would
-/// land before all images of a submission, not between them.
+/// take effect before all images of a submission, not between them.
 #[derive(Debug)]
 pub(crate) struct Constants {
     buffer: StorageBuffer<u32>,
@@ -19,7 +20,7 @@ pub(crate) struct Constants {
 }
 
 impl Constants {
-    /// Room for constants of these sizes, bytes: multiples of 4, at most [`ALIGNMENT`].
+    /// Allocates constants of these sizes, bytes: multiples of 4, at most [`ALIGNMENT`].
     pub(crate) fn new(gpu: &GpuContext, sizes: &[usize]) -> Result<Self, GpuError> {
         let buffer = StorageBuffer::zeroed(gpu, "constants", sizes.len() * ALIGNMENT / size_of::<u32>())?;
         Ok(Self { buffer, sizes: sizes.to_vec() })
@@ -36,7 +37,7 @@ impl Constants {
         self.buffer.encode_write(gpu, encoder, &words);
     }
 
-    /// The constant number `index`.
+    /// Returns the binding of constant number `index`.
     pub(crate) fn get(&self, index: usize) -> BindingResource<'_> {
         let size = self.sizes.get(index).and_then(|&size| BufferSize::new(size as u64));
         let offset = if size.is_some() { (index * ALIGNMENT) as u64 } else { 0 };

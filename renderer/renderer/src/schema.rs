@@ -1,18 +1,18 @@
-//! The attributes of a Gaussian: the one place that names them for buffers, kernels, read-back and files.
+//! Attributes of a Gaussian: the single definition for buffers, kernels, read-back and files.
 //!
 //! On the wire (`transport/stream/src/splats.rs`) a splat has `center_scale` and `color` in its own quantisation; `normal` and
 //! `canonical` stay on the device.
 
 use flyrig_gpu::{GpuContext, GpuError, StorageBuffer};
 
-use crate::HarmonicOrder;
+use crate::anisotropic::order::HarmonicOrder;
 
 /// Element of every attribute's buffer.
 pub type GaussianElement = [f32; 4];
-/// The same in WGSL.
+/// WGSL type of a [`GaussianElement`].
 const WGSL_ELEMENT: &str = "vec4<f32>";
 
-/// One attribute of every Gaussian, a [`GaussianElement`] each in a buffer of its own.
+/// Attribute of every Gaussian, one [`GaussianElement`] each in a separate buffer.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct GaussianAttribute {
     /// Name of the buffer in Rust and WGSL.
@@ -70,8 +70,8 @@ pub const SCALE_OPACITY: GaussianAttribute = GaussianAttribute {
 /// Quaternion of any length: world from the Gaussian's axes.
 pub const ROTATION: GaussianAttribute =
     GaussianAttribute { name: "rotation", label: "Gaussian rotations", components: ["x", "y", "z", "w"], unit: "none" };
-/// Coefficients of the colour by direction, [`HarmonicOrder::coefficients`](crate::HarmonicOrder::coefficients) elements a
-/// Gaussian one after the other.
+/// Coefficients of the colour by direction, [`HarmonicOrder::coefficients`](crate::HarmonicOrder::coefficients)
+/// consecutive elements per Gaussian.
 pub const HARMONICS: GaussianAttribute = GaussianAttribute {
     name: "harmonics",
     label: "Gaussian harmonics",
@@ -90,8 +90,8 @@ pub const PLY_PROPERTIES: [&str; 17] = [
     "rot_1", "rot_2", "rot_3",
 ];
 
-/// Properties of an anisotropic Gaussian in a PLY file: [`PLY_PROPERTIES`] with the further harmonics after the constant ones, all
-/// coefficients of red, then of green, then of blue.
+/// Returns the properties of an anisotropic Gaussian in a PLY file: [`PLY_PROPERTIES`] with the higher harmonics after
+/// the constant ones, all coefficients of red, then of green, then of blue.
 pub(crate) fn anisotropic_ply_properties(order: HarmonicOrder) -> Vec<String> {
     const CONSTANT: usize = 9;
     let rest = (0..3 * (order.coefficients() - 1)).map(|k| format!("f_rest_{k}"));
@@ -109,7 +109,7 @@ impl GaussianAttribute {
     }
 }
 
-/// WGSL declarations of attributes as read-only bindings of group 0, from binding `first` on.
+/// Returns WGSL declarations of attributes as read-only bindings of group 0, from binding `first` on.
 pub(crate) fn bindings_wgsl(first: u32, attributes: &[GaussianAttribute]) -> String {
     let declare = |(binding, attribute): (u32, &GaussianAttribute)| {
         format!("@group(0) @binding({binding}) var<storage, read> {}: array<{WGSL_ELEMENT}>;\n", attribute.name)
@@ -117,8 +117,8 @@ pub(crate) fn bindings_wgsl(first: u32, attributes: &[GaussianAttribute]) -> Str
     (first..).zip(attributes).map(declare).collect()
 }
 
-/// WGSL declarations of the attributes' derivatives, each named as its attribute with `_out`, as bindings of group 0 from
-/// binding `first` on.
+/// Returns WGSL declarations of the attributes' derivatives, each named as its attribute with `_out`, as bindings of
+/// group 0 from binding `first` on.
 pub(crate) fn derivatives_wgsl(first: u32, attributes: &[GaussianAttribute]) -> String {
     let declare = |(binding, attribute): (u32, &GaussianAttribute)| {
         format!(

@@ -1,7 +1,7 @@
-//! Which Gaussians make up which pixels: the rasteriser's image as a sparse matrix over the colours.
+//! Shares of Gaussians in pixels: the rasteriser's image as a sparse matrix over the colours.
 //!
-//! An image is linear in the Gaussians' colours while nothing moves. Training colours on a few thousand pixels needs the
-//! rows of that matrix once, not a rendering a step.
+//! An image is linear in the Gaussians' colours while nothing moves. Training colours on a few thousand pixels needs
+//! the rows of that matrix once instead of a rendering per step.
 
 use std::collections::HashMap;
 
@@ -9,12 +9,12 @@ use flyrig_types::Camera;
 use glam::{DVec2, DVec3};
 use rayon::prelude::*;
 
-use crate::RasterSettings;
-use crate::raster_kernels::{BACKFACING_COSINE, CUT, MAX_ALPHA, OPAQUE};
+use crate::raster::kernels::{BACKFACING_COSINE, CUT, MAX_ALPHA, OPAQUE};
+use crate::raster::settings::RasterSettings;
 
-/// Side of the squares in which wanted pixels are looked up.
+/// Side of the grid cells in which requested pixels are looked up, pixels.
 const CELL_PX: u32 = 8;
-/// Step of the difference that gives the projection's derivative, metres.
+/// Step of the finite difference for the projection's derivative, metres.
 const STEP_M: f64 = 1e-4;
 
 /// Opaque Gaussians in the world, as in [`GaussianBuffers`](crate::GaussianBuffers).
@@ -26,11 +26,10 @@ pub struct PosedGaussians<'a> {
     pub normal: &'a [[f32; 4]],
 }
 
-/// Rows of the matrix, one a pixel.
+/// Rows of the matrix, one per pixel.
 #[derive(Debug, Clone, PartialEq, Default)]
 pub struct PixelShares {
-    /// Per pixel in the order asked for: Gaussian and its share of the pixel, front to back. A pixel's shares sum to
-    /// its alpha.
+    /// Gaussian and its share of the pixel, front to back, for each requested pixel. A pixel's shares sum to its alpha.
     pub rows: Vec<Vec<(u32, f32)>>,
 }
 
@@ -39,13 +38,14 @@ struct Splat {
     pixel: DVec2,
     depth: f64,
     opacity: f64,
-    /// xx, xy, yy of the inverse covariance, halved.
+    /// Entries xx, xy, yy of the inverse covariance, halved.
     conic: [f64; 3],
     extent: DVec2,
 }
 
-/// Shares of the Gaussians, all of opacity 1, in these pixels (x, y), by the rules of [`Rasterizer`](crate::Rasterizer).
-/// Pixels may lie anywhere; a row is empty where no Gaussian reaches.
+/// Computes the shares of the Gaussians, all of opacity 1, in these pixels (x, y), by the rules of
+/// [`Rasterizer`](crate::Rasterizer). Pixels may lie outside the image; the row of a pixel without any Gaussian is
+/// empty.
 #[must_use]
 pub fn pixel_shares(
     camera: &Camera,

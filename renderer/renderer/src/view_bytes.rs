@@ -1,20 +1,21 @@
-//! Drawn views as bytes.
+//! Conversion of rendered views to bytes on the device.
 
 use flyrig_gpu::{ComputeKernel, GpuContext, GpuError, StorageBuffer, dispatch_1d};
 use flyrig_model::srgb;
 use wgpu::{CommandEncoder, ComputePassDescriptor};
 
-use crate::scan::run;
-use crate::{RenderTarget, rgba8_from_target};
+use crate::buffers::RenderTarget;
+use crate::color::rgba8_from_target;
+use crate::sort::scan::run;
 
 pub(crate) const WGSL: &str = include_str!("view_bytes.wgsl");
 
-/// Converts drawn views to bytes where they lie, so that a quarter of the data is read back.
+/// Converter of rendered views to bytes on the device, so that a quarter of the data is read back.
 #[derive(Debug)]
 pub struct ViewBytes {
-    /// None on the processor.
+    /// `None` on the processor.
     kernel: Option<ComputeKernel>,
-    /// A pixel an element; as many as the largest view so far.
+    /// One element per pixel; as many as the largest view so far.
     bytes: StorageBuffer<u32>,
     count: StorageBuffer<[u32; 4]>,
 }
@@ -56,7 +57,7 @@ impl ViewBytes {
         Ok(())
     }
 
-    /// Waits for the device and returns the view that was recorded last, which must be this one: straight-alpha sRGB, RGBA of 8
+    /// Waits for the device and returns the view recorded last, which must be `target`: straight-alpha sRGB, RGBA of 8
     /// bits, row by row ([`rgba8_from_target`]; on the device a byte may be off by one).
     ///
     /// # Errors

@@ -1,11 +1,15 @@
-//! Gaussians to views: rasteriser, target and bytes in one.
+//! Rendering of Gaussians to bytes: rasteriser, target and conversion in one type.
 
 use flyrig_gpu::{GpuContext, GpuError};
 use flyrig_types::{Camera, RenderedView};
 
-use crate::{Gaussians, Outputs, RasterSettings, Rasterizer, RenderTarget, ViewBytes};
+use crate::anisotropic::buffers::Gaussians;
+use crate::buffers::RenderTarget;
+use crate::raster::rasterizer::Rasterizer;
+use crate::raster::settings::{Outputs, RasterSettings};
+use crate::view_bytes::ViewBytes;
 
-/// Draws views of one scene after the other; buffers are made once and grow with the image and the number of Gaussians.
+/// Renderer of single views; its buffers are created once and grow with the image and the number of Gaussians.
 #[derive(Debug)]
 pub struct ViewPainter {
     gpu: GpuContext,
@@ -15,7 +19,7 @@ pub struct ViewPainter {
 }
 
 impl ViewPainter {
-    /// Room for so many Gaussians.
+    /// Creates a painter with buffers for `max_gaussians`.
     ///
     /// # Errors
     /// [`GpuError::TooLarge`].
@@ -28,7 +32,7 @@ impl ViewPainter {
         })
     }
 
-    /// Draws Gaussians as a camera sees them, at its size, and waits for the result; straight alpha.
+    /// Renders Gaussians from a camera at its image size and waits for the result, straight alpha.
     ///
     /// # Errors
     /// [`GpuError`].

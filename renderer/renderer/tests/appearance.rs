@@ -7,10 +7,10 @@ use appearance_support::{
     reference::{self, MID_GREY},
     scene::{self, Frame, Person, View},
 };
-use flyrig_gpu::{GpuContext, StorageBuffer, testing::on_both};
+use flyrig_gpu::{GpuContext, testing::on_both};
 use flyrig_renderer::{
     AppearanceError, AppearanceSettings, DiffusionHierarchy, DirectAppearance, GaussianBuffers, Outputs,
-    RasterSettings, Rasterizer, RenderTarget, ViewInput, linear_from_srgb,
+    RasterSettings, Rasterizer, RenderTarget, linear_from_srgb,
 };
 use glam::{DVec3, DVec4};
 
@@ -45,21 +45,8 @@ impl Rig {
     ) -> Result<Vec<[f32; 4]>, AppearanceError> {
         self.buffers.center_scale.write(&self.gpu, &frame.center_scale);
         self.buffers.normal.write(&self.gpu, &frame.normal);
-        let upload = |map: &[[f32; 4]]| StorageBuffer::from_slice(&self.gpu, "map", map).unwrap();
-        let image = |rgba: &[u8]| StorageBuffer::from_bytes(&self.gpu, "image", rgba).unwrap();
-        let maps: Vec<_> =
-            views.iter().map(|view| (image(&view.rgba), upload(&view.canonical), upload(&view.drawn))).collect();
-        let inputs: Vec<_> = views
-            .iter()
-            .zip(&maps)
-            .map(|(view, (picture, canonical, drawn))| ViewInput {
-                camera: &view.camera,
-                picture,
-                canonical,
-                drawn,
-                gaussians: None,
-            })
-            .collect();
+        let maps = scene::upload(&self.gpu, views).unwrap();
+        let inputs = scene::inputs(views, &maps);
         let mut encoder = self.gpu.device.create_command_encoder(&Default::default());
         self.appearance.update(&self.gpu, &mut encoder, &self.buffers, &inputs, settings)?;
         self.gpu.queue.submit([encoder.finish()]);
@@ -215,7 +202,7 @@ fn poison_never_reaches_the_memory() {
         let mut bad_views = views.clone();
         for view in &mut bad_views {
             view.canonical.iter_mut().step_by(3).enumerate().for_each(|(i, c)| *c = [poison[i % poison.len()]; 4]);
-            view.drawn.iter_mut().step_by(2).enumerate().for_each(|(i, c)| *c = [poison[i % poison.len()]; 4]);
+            view.rendered.iter_mut().step_by(2).enumerate().for_each(|(i, c)| *c = [poison[i % poison.len()]; 4]);
         }
         bad_views[0].camera.camera_from_world.translation.x = f64::NAN;
         for settings in ablations() {
@@ -257,10 +244,11 @@ fn what_is_painted_draws_the_image_again() {
                     let color = RasterSettings { outputs: Outputs::COLOR, ..Default::default() };
                     rasterizer.encode(&rig.gpu, &mut encoder, &rig.buffers, &view.camera, &color, &target).unwrap();
                     rig.gpu.queue.submit([encoder.finish()]);
-                    view.drawn = target.color.read(&rig.gpu).unwrap();
-                    for (drawn, wanted) in view.drawn.iter().zip(view.rgba.chunks_exact(4)) {
-                        if wanted[3] == 255 && drawn[3] > 0.9 {
-                            let off = |c: usize| drawn[c] / drawn[3] - linear_from_srgb(f32::from(wanted[c]) / 255.0);
+                    view.rendered = target.color.read(&rig.gpu).unwrap();
+                    for (rendered, wanted) in view.rendered.iter().zip(view.rgba.chunks_exact(4)) {
+                        if wanted[3] == 255 && rendered[3] > 0.9 {
+                            let off =
+                                |c: usize| rendered[c] / rendered[3] - linear_from_srgb(f32::from(wanted[c]) / 255.0);
                             errors.0 += (0..3).map(|c| off(c) * off(c)).sum::<f32>();
                             errors.1 += 3.0;
                         }
@@ -270,7 +258,7 @@ fn what_is_painted_draws_the_image_again() {
             (errors.0 / errors.1).sqrt()
         };
         let [plain, once, sharp] = [(0.0, 12), (0.8, 1), (0.8, 12)].map(|(share, frames)| error_after(share, frames));
-        println!("RMS of the drawn images, linear light: plain {plain:.4}, sharpened {sharp:.4}");
+        println!("RMS of the rendered images, linear light: plain {plain:.4}, sharpened {sharp:.4}");
         assert!((once - plain).abs() < 0.02 * plain, "nothing is known in the first frame: {once}, {plain}");
         assert!(sharp < 0.8 * plain, "{sharp} {plain}");
     });
@@ -366,9 +354,9 @@ fn refusals_name_the_view_and_the_mend() {
         let message = rig.try_update(&frame, &other, &settings).unwrap_err().to_string();
         assert!(message.contains("camera fisheye: the canonical map has 255 pixels"), "{message}");
         let mut no_drawing = views.clone();
-        no_drawing[0].drawn.clear();
+        no_drawing[0].rendered.clear();
         let message = rig.try_update(&frame, &no_drawing, &settings).unwrap_err().to_string();
-        assert!(message.contains("the drawn image has 0 pixels"), "{message}");
+        assert!(message.contains("the rendered image has 0 pixels"), "{message}");
         let four = [&views[..], &views[..1]].concat();
         let message = rig.try_update(&frame, &four, &settings).unwrap_err().to_string();
         assert!(message.contains("made for 3 views but is given 4"), "{message}");

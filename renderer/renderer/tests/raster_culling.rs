@@ -1,4 +1,4 @@
-//! What skipping back-facing Gaussians changes on a closed surface.
+//! Effect of skipping back-facing Gaussians on a closed surface.
 
 mod support;
 

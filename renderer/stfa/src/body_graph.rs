@@ -1,39 +1,57 @@
-//! What the networks know of a body before the first image.
+//! Description of a body for the networks, known before the first image.
 
 use flyrig_body::{DeformationGraph, Part, SurfaceGaussians};
 use glam::Vec3;
 
 use crate::StfaError;
 
-/// Gaussians that a node's own image feature is the mean of.
+/// Number of Gaussians over which a node's image feature is averaged.
 pub const POOLED: usize = 8;
-/// Edges of a node: four along the surface, and one to its mirror image.
+/// Edges per node: four along the surface, and one to its mirror image.
 pub const EDGES: usize = 5;
-/// Numbers that describe a node's place on the body: position with three octaves of sine and cosine, normal, part.
+/// Length of a node's positional encoding: position with three octaves of sine and cosine, normal, part.
 pub const PLACE: usize = 3 + 3 * 2 * OCTAVES + 3 + Part::ALL.len();
 
 const OCTAVES: usize = 3;
-/// Nodes of a Gaussian that weigh less do not count it among theirs.
+/// Weight below which a Gaussian does not belong to a node.
 const MIN_POOL_WEIGHT: f32 = 0.25;
 
-/// The deformation graph as the networks see it.
+/// Deformation graph in the form that the networks take.
+///
+/// # Examples
+/// ```
+/// use flyrig_body::{DEFAULT_SIGMA2_M2, ShapeParams, build_graph, default_template, sample_surface};
+/// use flyrig_stfa::{BodyGraph, LearnedAppearance, Parameters};
+///
+/// let template = default_template(&ShapeParams::default())?;
+/// let surface = sample_surface(&template, 2000, 1)?;
+/// let graph = build_graph(&template, &surface, 100, DEFAULT_SIGMA2_M2)?;
+/// let body = BodyGraph::new(&surface, &graph)?;
+/// assert_eq!((body.gaussians(), body.nodes()), (surface.len(), graph.nodes.len()));
+/// // The same weights serve every body.
+/// let networks = LearnedAppearance::new(&Parameters::named("tiny".as_ref())?, body);
+/// assert_eq!(networks.counts.views_encoded, 0);
+/// # Ok::<(), Box<dyn std::error::Error>>(())
+/// ```
 #[derive(Debug, Clone, PartialEq)]
 pub struct BodyGraph {
     /// Nodes of each Gaussian.
     pub gaussian_nodes: Vec<[u32; 4]>,
-    /// Their weights, which sum to 1.
+    /// Weights of these nodes, which sum to 1.
     pub gaussian_weights: Vec<[f32; 4]>,
-    /// Neighbours of each node; the last is the node nearest to its mirror image across the body's middle plane.
+    /// Neighbours of each node; the last one is the node nearest to its mirror image across the body's middle plane.
     pub edges: Vec<[u32; EDGES]>,
-    /// Gaussians whose mean a node is.
+    /// Gaussians over which a node's image feature is averaged.
     pub pooled: Vec<[u32; POOLED]>,
     /// Canonical positional encoding of each node, independent of the body's height.
     pub place: Vec<[f32; PLACE]>,
 }
 
 impl BodyGraph {
+    /// Builds the graph of a body from its Gaussians and its deformation graph.
+    ///
     /// # Errors
-    /// [`StfaError::Body`] when Gaussians and graph do not fit each other.
+    /// [`StfaError::Body`] where Gaussians and graph do not fit each other.
     pub fn new(surface: &SurfaceGaussians, graph: &DeformationGraph) -> Result<Self, StfaError> {
         let (gaussians, nodes) = (surface.len(), graph.nodes.len());
         let refuse = |what: String| Err(StfaError::Body(what));
@@ -82,26 +100,26 @@ impl BodyGraph {
         })
     }
 
-    /// Number of Gaussians.
+    /// Returns the number of Gaussians.
     #[must_use]
     pub fn gaussians(&self) -> usize {
         self.gaussian_nodes.len()
     }
 
-    /// Number of graph nodes.
+    /// Returns the number of graph nodes.
     #[must_use]
     pub fn nodes(&self) -> usize {
         self.edges.len()
     }
 
-    /// The node on the other side of the body.
+    /// Returns the mirrored node on the other side of the body.
     #[must_use]
     pub fn mirror(&self, node: usize) -> usize {
         self.edges[node][EDGES - 1] as usize
     }
 }
 
-/// Nearest node to each node's mirror image across the plane x = `middle`.
+/// Returns the node nearest to each node's mirror image across the plane x = `middle`.
 fn mirrored(nodes: &[Vec3], middle: f32) -> Vec<u32> {
     let nearest = |node: &Vec3| {
         let image = Vec3::new(2.0 * middle - node.x, node.y, node.z);
@@ -133,7 +151,7 @@ fn encode_place(position: Vec3, normal: Vec3, part: Part) -> [f32; PLACE] {
     out
 }
 
-/// Gaussians spread evenly over those that hang on each node; the node's own one where there are none.
+/// Selects Gaussians spread evenly over those of each node; the node's own one where it has none.
 fn pooled(graph: &DeformationGraph) -> Vec<[u32; POOLED]> {
     let mut lists = vec![Vec::new(); graph.nodes.len()];
     for (gaussian, (nodes, weights)) in graph.gaussian_nodes.iter().zip(&graph.gaussian_weights).enumerate() {

@@ -1,4 +1,4 @@
-//! Pixels of a camera that was no input: the Gaussians' colours drawn there, beside the truth.
+//! Comparison of the Gaussians' colours with the pixels of a held-out camera.
 
 use flyrig_learn::{
     burn_tensor::{Device, Tensor},
@@ -11,40 +11,41 @@ use crate::{
     body_graph::PLACE,
     inputs::{NODE, STATE},
     network::{Network, feature_maps, linear_from_srgb, srgb_from_linear},
-    sample::{SHARES, Target, TrainingSample},
+    sample::{SHARES, TargetPixels, TrainingSample},
     structure::{fine_contrast, structural_similarity},
     taps::Taps,
     variation::Variation,
 };
 
-/// A sample's loss counts as if direct appearance's were this: well tracked people teach as much as badly tracked ones.
+/// Loss of direct appearance to which each sample is normalised, so that well and badly tracked people have equal
+/// weight.
 const USUAL_MSE: f64 = 0.01;
-/// Added to direct appearance's loss before that.
+/// Constant added to direct appearance's loss before the normalisation.
 const SMALL_MSE: f64 = 5e-4;
 
-/// How far drawn pixels are from the truth, sRGB.
+/// Errors of rendered pixels against the truth, sRGB.
 #[derive(Debug, Clone, Copy, PartialEq, Default)]
 pub struct Errors {
     /// Mean squared difference of the pixels on black: shape and colour.
     pub mse: f64,
-    /// As far as drawing and truth both cover a pixel: colour only.
+    /// Mean squared difference where rendering and truth both cover a pixel: colour only.
     pub color_mse: f64,
     /// Mean structural similarity of the patches, of colour only.
     pub ssim: f64,
-    /// Fine contrast over the truth's.
+    /// Fine contrast relative to the truth's.
     pub contrast: f64,
 }
 
-/// Errors on the same pixels.
+/// Errors of networks and direct appearance on the same pixels.
 #[derive(Debug, Clone, Copy, PartialEq, Default)]
 pub struct SampleErrors {
-    /// Of the networks.
+    /// Errors of the networks.
     pub learned: Errors,
-    /// Of direct appearance.
+    /// Errors of direct appearance.
     pub direct: Errors,
 }
 
-/// Errors on all targets of a sample; none without any.
+/// Computes the errors on all targets of a sample; `None` without any.
 #[must_use]
 pub fn evaluate(parameters: &Parameters, sample: &TrainingSample, space: bool) -> Option<SampleErrors> {
     if sample.targets.is_empty() || sample.crops.rgba.is_empty() {
@@ -80,36 +81,36 @@ impl Errors {
     }
 }
 
-/// Drawn pixels (pixel, sRGB) on black and what the camera saw.
+/// Rendered pixels (pixel, sRGB) on black and the camera's pixels.
 struct Pixels {
     ours: Tensor<2>,
     direct: Tensor<2>,
     truth: Tensor<2>,
 }
 
-/// A target's pixels as they are, and as far as drawing and truth both cover them: where they do not, black against
-/// cloth would teach dark seams, and only colours can be learned here.
+/// Pixels of a target, unmasked and masked to where rendering and truth both cover them: elsewhere, black against cloth
+/// would teach dark seams, and only colours can be learned here.
 pub(crate) struct Comparison {
     whole: Pixels,
     covered: Pixels,
 }
 
-/// What is trained on.
+/// Training loss.
 pub(crate) struct PixelLoss {
     pub(crate) total: Tensor<1>,
     /// Mean squared difference on black.
     pub(crate) mse: f64,
-    /// The same of direct appearance.
+    /// Mean squared difference of direct appearance on black.
     pub(crate) direct_mse: f64,
 }
 
 impl Comparison {
-    /// Draws a target with the colours that the networks give its Gaussians and with those of direct appearance; `visible`
-    /// and `node_feature` are the sampled features of Gaussians and nodes.
+    /// Renders a target with the networks' colours and with those of direct appearance; `visible` and `node_feature`
+    /// are the sampled features of Gaussians and nodes.
     pub(crate) fn new(
         network: &Network,
         sample: &TrainingSample,
-        target: &Target,
+        target: &TargetPixels,
         [visible, node_feature]: [Tensor<2>; 2],
         variation: Variation,
     ) -> Self {
@@ -152,7 +153,7 @@ impl Comparison {
         Self { whole, covered }
     }
 
-    /// Squared differences, what SSIM misses of 1, and the difference of fine contrast, weighted.
+    /// Computes the weighted sum of squared differences, 1 - SSIM, and the difference of fine contrast.
     pub(crate) fn loss(&self, structure_weight: f32, contrast_weight: f32) -> PixelLoss {
         let Pixels { ours, direct, truth } = &self.covered;
         let importance = USUAL_MSE / (number(mse(direct, truth)) + SMALL_MSE);
@@ -184,16 +185,16 @@ fn mse(a: &Tensor<2>, b: &Tensor<2>) -> Tensor<1> {
     (a.clone() - b.clone()).powf_scalar(2.0).mean()
 }
 
-/// A tensor of one number; none is not a number.
+/// Returns the number of a tensor of one element; NaN for an empty one.
 pub(crate) fn number(tensor: Tensor<1>) -> f64 {
     to_vec(tensor).first().copied().map_or(f64::NAN, f64::from)
 }
 
-/// f_curr of Eq. 9 at the target's Gaussians.
+/// Computes f_curr of Eq. 9 at the target's Gaussians.
 fn with_graph(
     network: &Network,
     sample: &TrainingSample,
-    target: &Target,
+    target: &TargetPixels,
     [visible, node_feature]: [Tensor<2>; 2],
     state: &[[f32; STATE]],
     variation: Variation,
@@ -210,7 +211,7 @@ fn with_graph(
     network.fill(visible, weight, around)
 }
 
-/// The input images in this variation, as the encoder takes them.
+/// Returns the input images of this variation in the encoder's format.
 pub(crate) fn planes(network: &Network, sample: &TrainingSample, variation: Variation) -> Tensor<4> {
     let crops = &sample.crops;
     let pixels = crops.width * crops.height;

@@ -1,21 +1,21 @@
-//! The person's box of every input image, and its fine detail.
+//! Crops of the input images to the person's box, and their fine detail.
 
 use flyrig_renderer::AppearanceSettings;
 use rayon::prelude::*;
 
 use crate::{StfaError, taps::FeatureMaps};
 
-/// Colours of fine and of coarse detail.
+/// Channels of fine and of coarse detail.
 pub const DETAIL: usize = 6;
 
-/// Pixels around the person that the networks see as well.
+/// Margin around the person, pixels.
 const MARGIN_PX: usize = 8;
-/// Sides are multiples of this: the encoder halves twice.
+/// Divisor of the sides of crops: the encoder halves twice.
 const MULTIPLE: usize = 4;
-/// Detail is what these blurs take away, standard deviations in pixels.
+/// Standard deviations of the blurs that separate fine and coarse detail, pixels.
 pub(crate) const BLURS_PX: [f32; 2] = [1.0, 3.0];
 
-/// An image as the engine holds it.
+/// Input image.
 #[derive(Debug, Clone, Copy)]
 pub struct ViewImage<'a> {
     /// Pixels.
@@ -26,7 +26,7 @@ pub struct ViewImage<'a> {
     pub rgba: &'a [u8],
 }
 
-/// The person's boxes, all of one size.
+/// Crops of all images, of one size.
 #[derive(Debug, Clone, PartialEq, Default)]
 pub struct Crops {
     /// Number of images.
@@ -35,17 +35,18 @@ pub struct Crops {
     pub width: usize,
     /// Pixels, a multiple of four.
     pub height: usize,
-    /// Pixel of each image that lies on the crop's first one.
+    /// Position of the crop's first pixel in each image.
     pub origins: Vec<[u32; 2]>,
-    /// View by view, row by row: sRGB and mask coverage.
+    /// sRGB and mask coverage, view by view, row by row.
     pub rgba: Vec<u8>,
 }
 
 impl Crops {
-    /// Cuts the masks' boxes out, grown to a common size. An image without a person gives an empty crop.
+    /// Crops the images to the boxes of their masks, enlarged to a common size. An image without a person gives an
+    /// empty crop.
     ///
     /// # Errors
-    /// [`StfaError::Frame`] when an image's bytes do not fit its size.
+    /// [`StfaError::Frame`] where an image's bytes do not fit its size.
     pub fn cut(pictures: &[ViewImage<'_>]) -> Result<Self, StfaError> {
         let mut boxes = Vec::with_capacity(pictures.len());
         for (view, picture) in pictures.iter().enumerate() {
@@ -73,15 +74,15 @@ impl Crops {
         Ok(Self { views: pictures.len(), width, height, origins, rgba })
     }
 
-    /// Bytes of one view.
+    /// Returns the bytes of one view.
     #[must_use]
     pub fn view(&self, view: usize) -> &[u8] {
         let bytes = self.width * self.height * 4;
         self.rgba.get(view * bytes..(view + 1) * bytes).unwrap_or_default()
     }
 
-    /// What the encoder sees of a view, channels first: sRGB 0..1 on the person, black elsewhere, and how far a pixel is
-    /// the person's.
+    /// Returns the encoder's input of a view, channels first: sRGB 0..1 on the person, black elsewhere, and the weight
+    /// of the mask.
     #[must_use]
     pub fn planes(&self, view: usize, settings: &AppearanceSettings) -> Vec<f32> {
         let pixels = self.width * self.height;
@@ -94,14 +95,14 @@ impl Crops {
         out
     }
 
-    /// sRGB values times belief, and belief.
+    /// Returns sRGB values times mask weight, and the weight.
     #[must_use]
     pub fn colors(&self, settings: &AppearanceSettings) -> FeatureMaps {
         let values = self.rgba.par_chunks_exact(4).flat_map_iter(|pixel| believed(pixel, settings)).collect();
         FeatureMaps { width: self.width, height: self.height, channels: 4, stride: 1, values }
     }
 
-    /// What two blurs take away from the sRGB values, the background left out.
+    /// Computes the detail that two blurs remove from the sRGB values, excluding the background.
     #[must_use]
     pub fn detail(&self, settings: &AppearanceSettings) -> FeatureMaps {
         let pixels = self.width * self.height;
@@ -125,19 +126,19 @@ impl Crops {
     }
 }
 
-/// As direct appearance believes a pixel of this coverage.
+/// Returns the weight of a pixel of this coverage, as in direct appearance.
 fn belief(coverage: u8, settings: &AppearanceSettings) -> f32 {
     ((f32::from(coverage) / 255.0 - settings.min_mask) / (1.0 - settings.min_mask)).clamp(0.0, 1.0)
 }
 
-/// sRGB 0..1 times belief, and belief.
+/// Returns sRGB 0..1 times mask weight, and the weight.
 fn believed(pixel: &[u8], settings: &AppearanceSettings) -> [f32; 4] {
     let belief = belief(pixel[3], settings);
     let color = |c: usize| belief * f32::from(pixel[c]) / 255.0;
     [color(0), color(1), color(2), belief]
 }
 
-/// Left, top, right, bottom (excluded) of what is covered, with a margin; empty without a person.
+/// Returns left, top, right, bottom (excluded) of the mask with a margin; empty without a person.
 fn person_box(rgba: &[u8], width: usize, height: usize) -> [usize; 4] {
     let (mut left, mut top, mut right, mut bottom) = (width, height, 0, 0);
     for (y, row) in rgba.chunks_exact(width * 4).enumerate() {
@@ -160,7 +161,7 @@ fn person_box(rgba: &[u8], width: usize, height: usize) -> [usize; 4] {
     ]
 }
 
-/// Shares of a pixel's neighbours in a row or column, an odd number of them; they sum to 1.
+/// Returns the blur's kernel, an odd number of weights that sum to 1.
 pub(crate) fn blur_kernel(sigma: f32) -> Vec<f32> {
     let radius = (2.5 * sigma).ceil() as isize;
     let kernel: Vec<f32> = (-radius..=radius).map(|d| (-0.5 * (d as f32 / sigma).powi(2)).exp()).collect();
@@ -168,7 +169,7 @@ pub(crate) fn blur_kernel(sigma: f32) -> Vec<f32> {
     kernel.into_iter().map(|weight| weight / total).collect()
 }
 
-/// Separable Gaussian blur, zero outside.
+/// Applies a separable Gaussian blur, zero outside.
 fn blurred(pixels: &[[f32; 4]], width: usize, sigma: f32) -> Vec<[f32; 4]> {
     let kernel = blur_kernel(sigma);
     let radius = (kernel.len() / 2) as isize;

@@ -1,41 +1,38 @@
-//! What can be wrong with weights and inputs.
+//! Errors of learned appearance.
 
 use std::path::PathBuf;
 
-/// Why learned appearance cannot go on. Nothing was changed then.
+/// Reason why an operation of learned appearance failed. Nothing was changed then.
 #[derive(Debug, thiserror::Error)]
 pub enum StfaError {
-    /// A file that cannot be read or written.
+    /// A file cannot be read or written.
     #[error("{path}: {source}")]
     File {
-        /// Which.
+        /// Path of the file.
         path: PathBuf,
-        /// The system's reason.
+        /// Reason given by the system.
         source: std::io::Error,
     },
-    /// Weights that are cut short, of another version or of another network.
+    /// Weights are truncated, of another version or of another network.
     #[error("weights {name}: {what}; use a weights file that this version of flyrig wrote")]
     Weights {
-        /// Which file, or "embedded".
+        /// Name of the file, or "embedded".
         name: String,
-        /// What is wrong.
+        /// Fault found.
         what: String,
     },
-    /// A training sample that is damaged.
+    /// A training sample is damaged.
     #[error("training sample {name}: {what}; delete it, the next run makes it again")]
     Sample {
-        /// Which file.
+        /// Name of the file.
         name: String,
-        /// What is wrong.
+        /// Fault found.
         what: String,
     },
-    /// Gaussians, graph and observations that do not belong together.
+    /// Gaussians, graph and observations do not belong together.
     #[error("learned appearance cannot use this body: {0}; build Gaussians and graph from the same template")]
     Body(String),
-    /// A frame's inputs of different lengths.
+    /// A frame's inputs have different lengths.
     #[error("learned appearance cannot use this frame: {0}")]
     Frame(String),
-    /// The networks' library and the graphics device do not get on.
-    #[error("the networks cannot use the graphics adapter: {0}; let them run on the processor")]
-    Device(String),
 }

@@ -1,4 +1,4 @@
-//! From what direct appearance observed to what the networks take in.
+//! Construction of the networks' inputs from the observations of direct appearance.
 
 use flyrig_renderer::{AppearanceSettings, Observations, linear_from_srgb, srgb_from_linear};
 use rayon::prelude::*;
@@ -10,41 +10,41 @@ use crate::{
     taps::{Tap, Taps},
 };
 
-/// Colours that a Gaussian's could move towards: around it, on the other side of the body, two bands of detail, and what
-/// the view saw that sees it best (how far views differ tells how well they are aligned).
+/// Number of candidate colours: around the Gaussian, on the other side of the body, two bands of detail, and that of
+/// the best view (the difference between views indicates their alignment).
 pub const CANDIDATES: usize = 5;
-/// Numbers of a Gaussian that pass through the memory beside its features: linear colour, visibility of itself and of its
-/// mirror image, candidates as differences of sRGB values.
+/// Length of a Gaussian's state, which passes through the memory with its features: linear colour, visibility of itself
+/// and of its mirror image, candidates as differences of sRGB values.
 pub const STATE: usize = 5 + 3 * CANDIDATES;
-/// Numbers that a node knows beside its image feature: sRGB of the diffused colour around it, visibility, the same of its
-/// mirror image.
+/// Length of a node's inputs besides its image feature: sRGB of the diffused colour around it and visibility, of itself
+/// and of its mirror image.
 pub const NODE: usize = 8;
 
-/// Where the best view's candidate stands.
+/// Offset of the best view's candidate in a state.
 const BEST: usize = STATE - 3;
 
-/// Gaussians that are gathered together.
+/// Gaussians per task.
 const CHUNK: usize = if cfg!(test) { 700 } else { 8192 };
 
-/// Sum of weights that halves the belief in a mean.
+/// Sum of weights at which a mean has half its confidence.
 pub(crate) const SMALL_WEIGHT: f32 = 0.02;
 
-/// A frame as the networks take it in, for all Gaussians or some of them.
+/// Networks' inputs of one frame, for all or some Gaussians.
 #[derive(Debug, Clone, PartialEq, Default)]
 pub struct FrameInputs {
-    /// A row a Gaussian (Eq. 5).
+    /// Samples of the feature maps, one row per Gaussian (Eq. 5).
     pub taps: Taps,
-    /// A [`STATE`] a Gaussian.
+    /// State per Gaussian, [`STATE`] numbers.
     pub state: Vec<[f32; STATE]>,
-    /// A Gaussian: share of its colour that was seen, exp(-k d) of the best view (Eq. 11).
+    /// Share of the colour that was seen, and exp(-k d) of the best view (Eq. 11), per Gaussian.
     pub seen: Vec<[f32; 2]>,
-    /// A row a node: mean of the Gaussians around it.
+    /// Samples of the feature maps, one row per node: mean of the Gaussians around it.
     pub node_taps: Taps,
-    /// A [`NODE`] a node.
+    /// Inputs per node, [`NODE`] numbers.
     pub nodes: Vec<[f32; NODE]>,
 }
 
-/// Finite, or 0.
+/// Replaces a non-finite number with 0.
 fn tame(value: f32) -> f32 {
     if value.is_finite() { value } else { 0.0 }
 }
@@ -53,11 +53,11 @@ fn srgb(linear: [f32; 3]) -> [f32; 3] {
     linear.map(srgb_from_linear)
 }
 
-/// Gathers the inputs of the Gaussians named by `which`, in its order; of all without it. `settings` are those of the update
-/// that observed.
+/// Gathers the inputs of the Gaussians in `which`, in its order; of all for `None`. `settings` are those of the
+/// observing update.
 ///
 /// # Errors
-/// [`StfaError::Frame`] when body, observations and crops do not fit each other.
+/// [`StfaError::Frame`] where body, observations and crops do not fit each other.
 pub fn frame_inputs(
     body: &BodyGraph,
     observed: &Observations,
@@ -137,7 +137,8 @@ pub fn frame_inputs(
     Ok(FrameInputs { taps, state, seen, node_taps, nodes: node_values })
 }
 
-/// Difference of two colours that were sampled with belief as their fourth number; zero where one of them was not seen.
+/// Returns the difference of two sampled colours, whose fourth number is the mask weight; zero where one of them was
+/// not seen.
 fn difference(a: &[f32], b: &[f32]) -> [f32; 3] {
     if a[3] > 1e-3 && b[3] > 1e-3 { std::array::from_fn(|c| tame(a[c] / a[3] - b[c] / b[3])) } else { [0.0; 3] }
 }
@@ -150,13 +151,14 @@ fn sum_weight(observed: &Observations, gaussian: usize) -> f32 {
     observed.views.iter().filter_map(|view| look(view[gaussian])).map(|[_, _, weight]| weight).sum()
 }
 
-/// Eq. 5: the weights count as they are until they sum to more than 1. The baseline without filling always normalises.
+/// Returns the normalisation of Eq. 5: weights are unchanged unless their sum exceeds 1. The baseline without
+/// inpainting always normalises.
 fn row_weight(observed: &Observations, settings: &AppearanceSettings, gaussian: usize) -> f32 {
     let sum = sum_weight(observed, gaussian);
     if settings.space { sum.max(1.0) } else { sum.max(1e-6) }
 }
 
-/// Pixel and weight, where a view has something to say.
+/// Returns pixel and weight, where a view shows the Gaussian.
 fn look([x, y, weight, _]: [f32; 4]) -> Option<[f32; 3]> {
     (weight > 0.0 && [x, y, weight].iter().all(|v| v.is_finite())).then_some([x, y, weight])
 }
@@ -170,7 +172,7 @@ fn push_taps(taps: &mut Taps, observed: &Observations, crops: &Crops, gaussian: 
     }
 }
 
-/// The same colour that direct appearance paints before its memory, and what could be better.
+/// Computes the colour that direct appearance paints before its memory, and the candidates.
 fn gaussian_state(
     body: &BodyGraph,
     observed: &Observations,

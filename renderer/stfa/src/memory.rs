@@ -3,19 +3,19 @@
 use flyrig_renderer::AppearanceSettings;
 use rayon::prelude::*;
 
-/// What was seen of every Gaussian so far.
+/// Features of every Gaussian accumulated so far.
 #[derive(Debug, Clone, Default, PartialEq)]
 pub struct FeatureMemory {
     width: usize,
     /// w_acc of each Gaussian.
     weights: Vec<f32>,
-    /// f_acc, `width` numbers a Gaussian.
+    /// f_acc, `width` numbers per Gaussian.
     features: Vec<f32>,
 }
 
 impl FeatureMemory {
-    /// Puts a memory together from w_acc of each Gaussian and f_acc, `width` numbers a Gaussian. Returns `None` for lengths that
-    /// do not fit each other, numbers that are not finite, and negative weights.
+    /// Assembles a memory from w_acc of each Gaussian and f_acc, `width` numbers per Gaussian. Returns `None` for
+    /// mismatched lengths, non-finite numbers, and negative weights.
     #[must_use]
     pub fn from_parts(width: usize, weights: Vec<f32>, features: Vec<f32>) -> Option<Self> {
         let fits = weights.len().checked_mul(width) == Some(features.len());
@@ -29,25 +29,25 @@ impl FeatureMemory {
         &self.weights
     }
 
-    /// Returns f_acc by Gaussian, [`Self::width`] numbers each.
+    /// Returns f_acc, [`Self::width`] numbers per Gaussian.
     #[must_use]
     pub fn features(&self) -> &[f32] {
         &self.features
     }
 
-    /// Returns the numbers of a Gaussian.
+    /// Returns the numbers per Gaussian.
     #[must_use]
     pub fn width(&self) -> usize {
         self.width
     }
 
-    /// Forgets everything.
+    /// Clears the memory.
     pub fn clear(&mut self) {
         self.weights.clear();
         self.features.clear();
     }
 
-    /// Makes room for so many Gaussians of `width` numbers each; forgets everything where that changes.
+    /// Resizes to `count` Gaussians of `width` numbers each; clears the memory where the size changes.
     pub fn fit(&mut self, gaussians: usize, width: usize) {
         if self.width != width || self.weights.len() != gaussians {
             self.width = width;
@@ -56,9 +56,10 @@ impl FeatureMemory {
         }
     }
 
-    /// Takes in the rows of this instant of the Gaussians from `first` on, and blends the past into them. `visible` is w_vis
-    /// a Gaussian, `seen` the share of it that was seen and exp(-k d) of the best view. A row with a number that is not
-    /// finite, or without weight, leaves the memory as it was; rows that [`Self::fit`] made no room for stay as they are.
+    /// Adds the current rows of the Gaussians from `first` on to the memory, and blends the memory into them. `visible`
+    /// is w_vis per Gaussian, `seen` the share of its colour that was seen and exp(-k d) of the best view. A row with a
+    /// non-finite number or without weight leaves the memory unchanged; rows beyond the size of [`Self::fit`] are
+    /// unchanged.
     pub fn fuse(
         &mut self,
         first: usize,

@@ -1,5 +1,4 @@
-//! The networks: encoder, graph transformer, filling (Eq. 9), colour. Written on burn's tensors, for training and painting
-//! alike.
+//! Networks on burn's tensors, for training and inference: encoder, graph transformer, inpainting (Eq. 9), colour.
 
 use flyrig_learn::{
     Tensors,
@@ -14,12 +13,12 @@ use crate::{
     taps::FeatureMaps,
 };
 
-/// Largest step towards a candidate; beyond 1, since detail that the drawing blurs may be exaggerated.
+/// Largest step towards a candidate; above 1, since detail blurred by rendering may be exaggerated.
 const GATE: f32 = 1.5;
 /// Largest residual, sRGB.
 const RESIDUAL: f32 = 0.3;
 
-/// The parameters on a device, ready to compute.
+/// Parameters on a device.
 #[derive(Debug, Clone)]
 pub(crate) struct Network {
     pub(crate) device: Device,
@@ -41,7 +40,7 @@ impl Network {
         activation::relu(module::conv2d(x, weight, Some(bias), options))
     }
 
-    /// Feature maps at three scales, channels last, of images (views, 4, height, width).
+    /// Computes feature maps at three scales, channels last, of images (views, 4, height, width).
     pub(crate) fn encode(&self, pictures: Tensor<4>) -> [Tensor<4>; 3] {
         let full = self.conv(pictures, "full", 1);
         let half = self.conv(full.clone(), "half", 2);
@@ -50,7 +49,8 @@ impl Network {
         [full, half, quarter].map(|maps| maps.permute([0, 2, 3, 1]))
     }
 
-    /// Graph-transformer convolution (Shi et al. 2021) over the nodes: image feature, node inputs, place -> node feature.
+    /// Applies the graph-transformer convolutions (Shi et al. 2021) over the nodes: image feature, node inputs,
+    /// positional encoding -> node feature.
     pub(crate) fn graph(
         &self,
         feature: Tensor<2>,
@@ -79,7 +79,7 @@ impl Network {
         x
     }
 
-    /// Layer normalisation.
+    /// Applies layer normalisation.
     fn normalized(&self, x: Tensor<2>, layer: usize) -> Tensor<2> {
         let centered = x.clone() - x.mean_dim(1);
         let variance = centered.clone().powf_scalar(2.0).mean_dim(1);
@@ -88,14 +88,14 @@ impl Network {
         centered / (variance + 1e-5).sqrt() * scale.unsqueeze::<2>() + shift.unsqueeze::<2>()
     }
 
-    /// f_curr of Eq. 9 from f_vis, w_vis and the graph's feature at the Gaussians.
+    /// Computes f_curr of Eq. 9 from f_vis, w_vis and the graph's feature at the Gaussians.
     pub(crate) fn fill(&self, visible: Tensor<2>, weight: Tensor<2>, graph: Tensor<2>) -> Tensor<2> {
         let filled = self.linear(Tensor::cat(vec![graph, visible.clone()], 1), "fill");
         (1.0 - weight) * filled + visible
     }
 
-    /// sRGB colours from rows of [`STATE`] numbers and a feature: the base colour, moved towards the candidates and by a
-    /// residual.
+    /// Computes sRGB colours from rows of [`STATE`] numbers and a feature: the base colour, moved towards the
+    /// candidates and by a residual.
     pub(crate) fn color(&self, rows: Tensor<2>) -> Tensor<2> {
         let count = rows.dims()[0];
         let base = srgb_from_linear(rows.clone().narrow(1, 0, 3));
@@ -110,37 +110,37 @@ impl Network {
         base + moved + out.narrow(1, CANDIDATES, 3) * RESIDUAL
     }
 
-    /// Planes (views, 4, height, width) from their numbers.
+    /// Creates a tensor of planes (views, 4, height, width).
     pub(crate) fn pictures(&self, planes: Vec<f32>, views: usize, height: usize, width: usize) -> Tensor<4> {
         Tensor::from_data(TensorData::new(planes, [views, 4, height, width]), &self.device)
     }
 
-    /// A table with `columns` columns.
+    /// Creates a table with `columns` columns.
     pub(crate) fn table(&self, values: Vec<f32>, columns: usize) -> Tensor<2> {
         let rows = values.len() / columns.max(1);
         Tensor::from_data(TensorData::new(values, [rows, columns]), &self.device)
     }
 
-    /// Indices for `select`.
+    /// Creates indices for `select`.
     pub(crate) fn indices(&self, values: impl Iterator<Item = u32>) -> Tensor<1, Int> {
         let values: Vec<i32> = values.map(|v| i32::try_from(v).unwrap_or(0)).collect();
         let count = values.len();
         Tensor::from_data(TensorData::new(values, [count]), &self.device)
     }
 
-    /// What the graph network knows of this body at every instant.
+    /// Returns the graph network's constant inputs for this body: positional encoding and edges.
     pub(crate) fn body_tensors(&self, body: &BodyGraph) -> (Tensor<2>, Tensor<1, Int>) {
         let place = self.table(body.place.as_flattened().to_vec(), PLACE);
         (place, self.indices(body.edges.as_flattened().iter().copied()))
     }
 
-    /// The node inputs of a frame.
+    /// Creates the node inputs of a frame.
     pub(crate) fn node_inputs(&self, nodes: &[[f32; NODE]]) -> Tensor<2> {
         self.table(nodes.as_flattened().to_vec(), NODE)
     }
 }
 
-/// The encoder's maps as plain numbers.
+/// Converts the encoder's maps to plain numbers.
 pub(crate) fn feature_maps(levels: &[Tensor<4>; 3]) -> Vec<FeatureMaps> {
     levels
         .iter()

@@ -1,4 +1,4 @@
-//! The networks' numbers: what there is, and how it starts.
+//! Parameters of the networks: names, shapes and initial values.
 
 use std::collections::BTreeMap;
 
@@ -10,7 +10,7 @@ use crate::{
     inputs::{CANDIDATES, NODE, STATE},
 };
 
-/// Sizes of the networks.
+/// Size of the networks.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct NetworkSize {
@@ -27,27 +27,27 @@ pub struct NetworkSize {
 }
 
 impl NetworkSize {
-    /// Small enough for two CPU cores.
+    /// Size for two CPU cores.
     pub const SMALL: Self = Self { channels: [8, 16, 24], node: 32, heads: 2, layers: 3, hidden: [48, 32] };
 
-    /// Half as wide.
+    /// Half as wide as `small`.
     pub const TINY: Self = Self { channels: [4, 8, 12], node: 16, heads: 2, layers: 2, hidden: [24, 16] };
-    /// Twice as wide.
+    /// Twice as wide as `small`.
     pub const MEDIUM: Self = Self { channels: [16, 32, 48], node: 64, heads: 4, layers: 4, hidden: [96, 64] };
 
-    /// Numbers of an image feature.
+    /// Returns the length of an image feature.
     #[must_use]
     pub fn feature(&self) -> usize {
         self.channels.iter().sum()
     }
 
-    /// Numbers of a Gaussian that pass through the memory.
+    /// Returns the length of a Gaussian's row in the memory.
     #[must_use]
     pub fn row(&self) -> usize {
         STATE + self.feature()
     }
 
-    /// Name, shape and spread at the start (0: all zero, negative: all one) of every parameter.
+    /// Returns name, shape and initial spread (0: all zero, negative: all one) of every parameter.
     pub(crate) fn parameters(&self) -> Vec<Start> {
         let mut list = Vec::new();
         let he = |fan_in: usize| (2.0 / fan_in as f32).sqrt();
@@ -85,31 +85,43 @@ impl NetworkSize {
     }
 }
 
-/// What the colour network gives: how far towards each candidate, and three residuals.
+/// Number of outputs of the colour network: step towards each candidate, and three residuals.
 pub(crate) const OUTPUTS: usize = CANDIDATES + 3;
 
-/// All parameters by name.
+/// Parameters by name.
+///
+/// # Examples
+/// ```
+/// use flyrig_stfa::{NetworkSize, Parameters};
+///
+/// let bundled = Parameters::named("tiny".as_ref())?;
+/// assert_eq!(bundled.size, NetworkSize::TINY);
+/// let untrained = Parameters::untrained(NetworkSize::TINY, 1);
+/// assert_eq!(untrained.count(), bundled.count());
+/// assert_ne!(untrained.digest(), bundled.digest());
+/// # Ok::<(), flyrig_stfa::StfaError>(())
+/// ```
 #[derive(Debug, Clone, PartialEq)]
 pub struct Parameters {
-    /// What they belong to.
+    /// Size of the networks that they belong to.
     pub size: NetworkSize,
     pub(crate) by_name: BTreeMap<String, Parameter>,
 }
 
 impl Parameters {
-    /// Untrained: paints as direct appearance does.
+    /// Creates untrained parameters, which give the colours of direct appearance.
     #[must_use]
     pub fn untrained(size: NetworkSize, seed: u64) -> Self {
         Self { size, by_name: drawn(size.parameters(), seed) }
     }
 
-    /// How many numbers there are.
+    /// Returns the number of scalars.
     #[must_use]
     pub fn count(&self) -> usize {
         flyrig_learn::count(&self.by_name)
     }
 
-    /// Whether every number is one.
+    /// Returns whether every number is finite.
     #[must_use]
     pub fn is_finite(&self) -> bool {
         flyrig_learn::is_finite(&self.by_name)

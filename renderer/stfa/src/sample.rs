@@ -1,4 +1,4 @@
-//! What one instant of a capture gives to the training: inputs of the networks, and pixels of other cameras.
+//! Training sample of one instant: inputs of the networks, and pixels of other cameras.
 
 use std::{collections::HashMap, path::Path};
 
@@ -16,67 +16,67 @@ use crate::{
     tensor_file::{TensorFile, array, read, rows},
 };
 
-/// Side of the squares of pixels that are compared.
+/// Side of the compared patches, pixels.
 pub const PATCH: usize = 16;
-/// Gaussians of a pixel, at most; what the others would add goes to these.
+/// Largest number of Gaussians per pixel; the shares of further ones are added to these.
 pub const SHARES: usize = 12;
 
 const VERSION: u32 = 2;
-/// A patch with less of the person or of the drawing in it teaches nothing.
+/// Least share of the person and of the rendering in a patch.
 const MIN_PATCH_COVERAGE: f32 = 0.15;
-/// Places tried for a patch.
+/// Positions tried per patch.
 const TRIES: usize = 40;
 
-/// A camera that is not an input, and what it saw.
+/// Held-out camera and its image.
 #[derive(Debug, Clone, Copy)]
 pub struct TargetImage<'a> {
-    /// The camera as it is.
+    /// Held-out camera.
     pub camera: &'a Camera,
-    /// Its image with mask.
+    /// Image with mask.
     pub picture: ViewImage<'a>,
 }
 
 /// Pixels of one held-out image and the Gaussians that they show.
 #[derive(Debug, Clone, PartialEq, Default)]
-pub struct Target {
-    /// A row a Gaussian.
+pub struct TargetPixels {
+    /// Samples of the feature maps, one row per Gaussian.
     pub taps: Taps,
-    /// A [`STATE`] a Gaussian.
+    /// State per Gaussian, [`STATE`] numbers.
     pub state: Vec<[f32; STATE]>,
     /// Nodes of each Gaussian.
     pub nodes: Vec<[u32; 4]>,
-    /// Their weights.
+    /// Weights of these nodes.
     pub node_weights: Vec<[f32; 4]>,
-    /// Per pixel, patch by patch: places in the lists above.
+    /// Indices into the lists above, per pixel, patch by patch.
     pub gaussians: Vec<[u32; SHARES]>,
-    /// Their shares of the pixel.
+    /// Shares of these Gaussians in the pixel.
     pub shares: Vec<[f32; SHARES]>,
-    /// The pixel's sRGB on black.
+    /// sRGB of the pixel on black.
     pub truth: Vec<[u8; 4]>,
 }
 
-/// One instant.
+/// Training sample of one instant.
 #[derive(Debug, Clone, PartialEq, Default)]
 pub struct TrainingSample {
-    /// The person in the input images.
+    /// Crops of the input images.
     pub crops: Crops,
-    /// A row a node.
+    /// Samples of the feature maps, one row per node.
     pub node_taps: Taps,
-    /// A [`NODE`] a node.
+    /// Inputs per node, [`NODE`] numbers.
     pub nodes: Vec<[f32; NODE]>,
     /// Neighbours of each node.
     pub edges: Vec<[u32; EDGES]>,
-    /// Place of each node.
+    /// Positional encoding of each node.
     pub place: Vec<[f32; PLACE]>,
     /// Held-out images.
-    pub targets: Vec<Target>,
+    pub targets: Vec<TargetPixels>,
 }
 
-/// Gathers a sample: the networks' inputs from `pictures` as direct appearance observed them, and `patches` squares of every
-/// held-out image, drawn at random by `seed`.
+/// Gathers a sample: the networks' inputs from `pictures` and their observations by direct appearance, and `patches`
+/// random squares of every held-out image, chosen by `seed`.
 ///
 /// # Errors
-/// [`StfaError::Frame`] when something does not fit.
+/// [`StfaError::Frame`] where inputs do not fit each other.
 #[allow(clippy::too_many_arguments)]
 pub fn training_sample(
     body: &BodyGraph,
@@ -100,7 +100,7 @@ pub fn training_sample(
         let shown = pixel_shares(target.camera, posed, &pixels, &RasterSettings::default()).rows;
         let mut places: HashMap<u32, u32> = HashMap::new();
         let mut which: Vec<u32> = Vec::new();
-        let mut out = Target::default();
+        let mut out = TargetPixels::default();
         for (row, &[x, y]) in shown.into_iter().zip(&pixels) {
             let (mut gaussians, mut shares) = ([0; SHARES], [0.0; SHARES]);
             let alpha: f32 = row.iter().map(|(_, share)| share).sum();
@@ -135,7 +135,7 @@ pub fn training_sample(
     Ok(sample)
 }
 
-/// Pixels of random squares on the person, square by square, row by row.
+/// Selects the pixels of random squares on the person, square by square, row by row.
 fn patch_pixels(picture: ViewImage<'_>, patches: usize, rng: &mut SmallRng) -> Vec<[u32; 2]> {
     let side = PATCH as u32;
     let mut pixels = Vec::new();
@@ -189,7 +189,7 @@ impl TrainingSample {
         file.write(path, HashMap::new())
     }
 
-    /// Reads a sample and checks that everything in it fits.
+    /// Reads a sample and checks its consistency.
     ///
     /// # Errors
     /// [`StfaError::File`], [`StfaError::Sample`] for a damaged one.
@@ -217,8 +217,8 @@ impl TrainingSample {
             rgba: array(file, "crop_rgba", &[views, height, width, 4])?,
         };
         let count = array::<u32>(file, "targets", &[1])?[0];
-        let target = |i: u32| -> Result<Target, String> {
-            Ok(Target {
+        let target = |i: u32| -> Result<TargetPixels, String> {
+            Ok(TargetPixels {
                 taps: taps(file, &format!("{i}"))?,
                 state: rows(file, &format!("{i}.state"))?,
                 nodes: rows(file, &format!("{i}.nodes"))?,
@@ -238,7 +238,7 @@ impl TrainingSample {
         })
     }
 
-    /// Whether all indices stay inside and all lists are as long as they must be.
+    /// Returns whether all indices are in range and all lists have the right length.
     fn check(&self) -> Result<(), String> {
         let nodes = self.edges.len();
         let views = self.crops.views;

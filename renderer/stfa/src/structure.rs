@@ -1,4 +1,4 @@
-//! Structural similarity (Wang et al. 2004) of patches, with box windows, and how much fine contrast they have.
+//! Structural similarity (Wang et al. 2004) of patches with box windows, and their fine contrast.
 
 use flyrig_learn::burn_tensor::{Tensor, module, ops::AvgPoolOptions};
 
@@ -7,22 +7,22 @@ use crate::sample::PATCH;
 /// Side of a window and distance of two windows, pixels.
 const WINDOW: usize = 8;
 const STRIDE: usize = 4;
-/// What keeps flat, dark windows calm, for values from 0 to 1.
+/// Stabilising constants of SSIM, for values from 0 to 1.
 const SMALL: [f32; 2] = [1e-4, 9e-4];
 
 /// Side of a window of fine contrast and distance of two windows, pixels.
 const FINE: usize = 4;
 const FINE_STRIDE: usize = 2;
-/// Added to a variance, so that its root has a slope everywhere.
+/// Constant added to a variance, so that its root is differentiable everywhere.
 const SMALL_VARIANCE: f32 = 1e-4;
 
-/// Patches as planes, from rows (pixel, 3): patch by patch, row by row.
+/// Converts rows (pixel, 3), patch by patch and row by row, to planes.
 fn planes(of: Tensor<2>) -> Tensor<4> {
     let patches = of.dims()[0] / (PATCH * PATCH);
     of.reshape([patches, PATCH, PATCH, 3]).permute([0, 3, 1, 2])
 }
 
-/// Standard deviation of every small window.
+/// Computes the standard deviation of every small window.
 pub(crate) fn fine_contrast(of: Tensor<2>) -> Tensor<4> {
     let mean = |of: Tensor<4>| module::avg_pool2d(of, AvgPoolOptions::new([FINE; 2]).with_stride([FINE_STRIDE; 2]));
     let of = planes(of);
@@ -30,7 +30,7 @@ pub(crate) fn fine_contrast(of: Tensor<2>) -> Tensor<4> {
     (variance.clamp_min(0.0) + SMALL_VARIANCE).sqrt()
 }
 
-/// Mean SSIM over windows and channels of rows (pixel, 3): patch by patch, row by row.
+/// Computes the mean SSIM over windows and channels of rows (pixel, 3), patch by patch and row by row.
 pub(crate) fn structural_similarity(ours: Tensor<2>, truth: Tensor<2>) -> Tensor<1> {
     let mean = |of: Tensor<4>| module::avg_pool2d(of, AvgPoolOptions::new([WINDOW; 2]).with_stride([STRIDE; 2]));
     let (a, b) = (planes(ours), planes(truth));
@@ -57,7 +57,7 @@ mod tests {
         f64::from(flyrig_learn::to_vec(structural_similarity(rows(a), rows(b)))[0])
     }
 
-    /// Window by window, from differences to the mean.
+    /// Computes the reference in f64, window by window, from differences to the mean.
     fn reference(a: &[f32], b: &[f32]) -> f64 {
         let (mut sum, mut count) = (0.0, 0.0);
         for patch in 0..a.len() / (3 * PATCH * PATCH) {
@@ -102,7 +102,8 @@ mod tests {
         }
     }
 
-    /// Largest difference of the slopes by autodiff from finite differences of the f64 references, over the largest slope.
+    /// Returns the largest difference of the slopes by autodiff from finite differences of the f64 references, relative
+    /// to the largest slope.
     fn slope_error(size: usize, value: impl Fn(Tensor<2>) -> Tensor<1>, reference: impl Fn(&[f32]) -> f64) -> f64 {
         let mut rng = SmallRng::seed_from_u64(10);
         let a: Vec<f32> = (0..size).map(|_| rng.random_range(0.2..0.8)).collect();
@@ -139,7 +140,7 @@ mod tests {
         assert!(error < 1e-2, "contrast: {error}");
     }
 
-    /// Deviation of the window whose first pixel is this one, by definition.
+    /// Computes the deviation of the window that begins at this pixel, by definition.
     fn window_contrast(a: &[f32], y: usize, x: usize, c: usize) -> f64 {
         let values: Vec<f64> =
             (0..FINE * FINE).map(|k| f64::from(a[((y + k / FINE) * PATCH + x + k % FINE) * 3 + c])).collect();
@@ -147,7 +148,7 @@ mod tests {
         (values.iter().map(|v| (v - mean).powi(2)).sum::<f64>() / 16.0 + 1e-4).sqrt()
     }
 
-    /// Mean fine contrast, window by window.
+    /// Computes the mean fine contrast, window by window.
     fn fine_reference(a: &[f32]) -> f64 {
         let (mut sum, mut count) = (0.0, 0.0);
         for y in (0..=PATCH - FINE).step_by(FINE_STRIDE) {

@@ -1,21 +1,22 @@
-//! Pixel-aligned features (FlyHuman, Eq. 5): weighted bilinear samples of feature maps, and the way back for training.
+//! Pixel-aligned features (FlyHuman, Eq. 5): weighted bilinear samples of feature maps, and their derivative for
+//! training.
 
 use std::ops::Range;
 
 use rayon::prelude::*;
 
-/// One look of a row at one view.
+/// Sample of one view.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Tap {
     /// Index of the map.
     pub view: u32,
     /// Pixel of the full-size crop; centres at integers.
     pub pixel: [f32; 2],
-    /// Share in the row.
+    /// Weight in the row.
     pub weight: f32,
 }
 
-/// Rows of taps: each makes one feature vector.
+/// Rows of taps, each of which gives one feature vector.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Taps {
     /// First tap of each row, and the end.
@@ -37,26 +38,27 @@ pub struct FeatureMaps {
     pub width: usize,
     /// Rows of one map.
     pub height: usize,
-    /// Numbers a pixel.
+    /// Numbers per pixel.
     pub channels: usize,
-    /// Full-size pixels from one pixel to the next; pixel 0 lies on pixel 0.
+    /// Full-size pixels between neighbouring pixels; pixel 0 coincides with the full-size pixel 0.
     pub stride: usize,
     /// All maps.
     pub values: Vec<f32>,
 }
 
 impl FeatureMaps {
-    /// A map of the same form without numbers.
+    /// Returns a map of the same shape without numbers.
     pub(crate) fn without_values(&self) -> Self {
         Self { values: Vec::new(), ..*self }
     }
 
-    /// Numbers in one map.
+    /// Returns the number of values in one map.
     fn map_len(&self) -> usize {
         self.width * self.height * self.channels
     }
 
-    /// Offsets in a map and shares of the four pixels around a place; places outside are drawn to the border.
+    /// Returns offsets in a map and weights of the four pixels around a position; positions outside are clamped to the
+    /// border.
     fn corners(&self, pixel: [f32; 2]) -> [(usize, f32); 4] {
         let axis = |value: f32, size: usize| {
             let last = size.saturating_sub(1);
@@ -84,7 +86,7 @@ impl Taps {
         self.starts.push(self.taps.len() as u32);
     }
 
-    /// The rows of several one after another.
+    /// Concatenates the rows of several lists.
     #[must_use]
     pub(crate) fn joined(parts: Vec<Self>) -> Self {
         let mut out = Self::default();
@@ -97,19 +99,19 @@ impl Taps {
         out
     }
 
-    /// Number of rows.
+    /// Returns the number of rows.
     #[must_use]
     pub fn rows(&self) -> usize {
         self.starts.len().saturating_sub(1)
     }
 
-    /// Taps of a row.
+    /// Returns the taps of a row.
     #[must_use]
     pub fn row(&self, row: usize) -> &[Tap] {
         &self.taps[self.starts[row] as usize..self.starts[row + 1] as usize]
     }
 
-    /// Whether every tap looks at one of `views` maps.
+    /// Returns whether every tap refers to one of `views` maps.
     #[must_use]
     pub fn fits(&self, views: usize) -> bool {
         self.starts.first() == Some(&0)
@@ -118,7 +120,7 @@ impl Taps {
             && self.taps.iter().all(|tap| (tap.view as usize) < views)
     }
 
-    /// Of every row the tap that weighs most, with weight 1; the first of several.
+    /// Selects the tap with the largest weight in every row, the first one of equals, and sets its weight to 1.
     #[must_use]
     pub fn heaviest(&self) -> Self {
         let mut out = Self::default();
@@ -135,7 +137,7 @@ impl Taps {
         out
     }
 
-    /// The same looks at images of `width` pixels that were turned left to right.
+    /// Mirrors the taps for horizontally flipped images of `width` pixels.
     #[must_use]
     pub fn flipped(&self, width: usize) -> Self {
         let last = width.saturating_sub(1) as f32;
@@ -143,13 +145,13 @@ impl Taps {
         Self { starts: self.starts.clone(), taps: self.taps.iter().map(turn).collect() }
     }
 
-    /// Row by row the features of all scales one after another. Taps must fit the maps' number of views.
+    /// Samples the concatenated features of all scales, row by row. Taps must fit the maps' number of views.
     #[must_use]
     pub fn sample(&self, levels: &[FeatureMaps]) -> Vec<f32> {
         self.sample_rows(levels, 0..self.rows())
     }
 
-    /// The same of some rows.
+    /// Samples some rows, as [`Self::sample`] does.
     #[must_use]
     pub fn sample_rows(&self, levels: &[FeatureMaps], rows: Range<usize>) -> Vec<f32> {
         let channels: usize = levels.iter().map(|level| level.channels).sum();
@@ -173,7 +175,7 @@ impl Taps {
         out
     }
 
-    /// From dL/d rows to dL/d maps: the transpose of [`Self::sample`]. Sums run in the order of the rows.
+    /// Computes dL/d maps from dL/d rows: the transpose of [`Self::sample`]. Sums run in the order of the rows.
     #[must_use]
     pub fn sample_backward(&self, levels: &[FeatureMaps], row_gradients: &[f32]) -> Vec<Vec<f32>> {
         let channels: usize = levels.iter().map(|level| level.channels).sum();
@@ -233,7 +235,7 @@ mod tests {
         (taps, levels)
     }
 
-    /// Interpolation written the long way, in f64.
+    /// Computes the interpolation in f64.
     fn reference(taps: &Taps, levels: &[FeatureMaps], row: usize) -> Vec<f64> {
         let mut out = Vec::new();
         for level in levels {

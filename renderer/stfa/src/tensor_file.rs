@@ -1,4 +1,4 @@
-//! Named arrays in a safetensors file, written whole.
+//! Named arrays in a safetensors file, written atomically.
 
 use std::{collections::HashMap, io::Write as _, path::Path};
 
@@ -8,7 +8,7 @@ use safetensors::{Dtype, SafeTensors, tensor::TensorView};
 
 use crate::StfaError;
 
-/// A number that such a file can hold.
+/// Number type that such a file can hold.
 pub(crate) trait Number: Pod {
     const DTYPE: Dtype;
 }
@@ -25,7 +25,7 @@ impl Number for u8 {
     const DTYPE: Dtype = Dtype::U8;
 }
 
-/// Arrays to be written.
+/// Collection of arrays to write.
 #[derive(Debug, Default)]
 pub(crate) struct TensorFile {
     arrays: Vec<(String, Dtype, Vec<usize>, Vec<u8>)>,
@@ -53,7 +53,7 @@ impl TensorFile {
     }
 }
 
-/// The numbers of an array, which must have this shape.
+/// Reads the numbers of an array, which must have this shape.
 pub(crate) fn array<T: Number>(file: &SafeTensors<'_>, name: &str, shape: &[usize]) -> Result<Vec<T>, String> {
     let found = view::<T>(file, name)?;
     if found.shape() != shape {
@@ -62,7 +62,7 @@ pub(crate) fn array<T: Number>(file: &SafeTensors<'_>, name: &str, shape: &[usiz
     Ok(bytemuck::pod_collect_to_vec(found.data()))
 }
 
-/// Rows of `N` numbers each.
+/// Reads rows of `N` numbers each.
 pub(crate) fn rows<T: Number, const N: usize>(file: &SafeTensors<'_>, name: &str) -> Result<Vec<[T; N]>, String>
 where
     [T; N]: Pod,
@@ -82,7 +82,7 @@ fn view<'a, T: Number>(file: &SafeTensors<'a>, name: &str) -> Result<TensorView<
     Ok(found)
 }
 
-/// The file's bytes.
+/// Reads a file's bytes.
 pub(crate) fn read(path: &Path) -> Result<Vec<u8>, StfaError> {
     std::fs::read(path).map_err(|source| StfaError::File { path: path.to_owned(), source })
 }

@@ -1,14 +1,15 @@
-//! Training: pixels of cameras that were not inputs, compared with what the coloured Gaussians would show there.
+//! Training on pixels of held-out cameras, compared with the rendering of the coloured Gaussians.
 //!
-//! An image is linear in the Gaussians' colours, so a sample carries the shares of the Gaussians in its pixels and no
-//! image is drawn. The temporal memory is left out, as the paper does. Pixel-aligned sampling stands between two tapes:
-//! the gradient of the sampled features is carried back to the feature maps by hand and handed to the encoder's tape.
+//! An image is linear in the Gaussians' colours, so a sample carries the shares of the Gaussians in its pixels and
+//! nothing is rendered. The temporal memory is excluded, as in the paper. Pixel-aligned sampling separates two tapes:
+//! the gradient of the sampled features is computed by hand with respect to the feature maps and passed to the
+//! encoder's tape.
 
 use std::{collections::BTreeMap, path::Path};
 
 use flyrig_learn::{
     AdamStep, Moments,
-    burn_tensor::{Tensor, TensorData},
+    burn_tensor::{Device, Tensor, TensorData},
     to_vec,
 };
 use rand::{RngExt as _, SeedableRng as _, rngs::SmallRng, seq::SliceRandom as _};
@@ -16,42 +17,42 @@ use safetensors::SafeTensors;
 use serde::{Deserialize, Serialize};
 
 use crate::{
-    NetworkDevice, Parameters, StfaError,
+    Parameters, StfaError,
     comparison::{Comparison, PixelLoss, planes},
     network::{Network, feature_maps},
-    sample::{Target, TrainingSample},
+    sample::{TargetPixels, TrainingSample},
     taps::Taps,
     tensor_file::{TensorFile, array, read},
     variation::Variation,
     weights::header,
 };
 
-/// Exponential means of Adam (Kingma and Ba 2015).
+/// Decay rates of Adam's moments (Kingma and Ba 2015).
 const BETAS: [f32; 2] = [0.9, 0.99];
-/// Gradients longer than this are shortened to it.
+/// Length to which longer gradients are clipped.
 const MAX_GRADIENT: f32 = 1.0;
 
-/// How to train.
+/// Settings of a training.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields, default)]
 pub struct TrainSettings {
-    /// Order of samples, starting weights.
+    /// Seed of the order of samples and of the initial weights.
     pub seed: u64,
-    /// Steps in all; the rate falls to zero along half a cosine.
+    /// Total steps; the rate falls to zero along half a cosine.
     pub steps: u64,
     /// Adam's rate at the start.
     pub rate: f32,
-    /// Weight of what SSIM misses of 1 against the mean squared difference: the perceptual term, which keeps contrast
-    /// where the mean squared difference alone would rather blur.
+    /// Weight of 1 - SSIM relative to the mean squared difference: the perceptual term, which preserves contrast that
+    /// the mean squared difference alone would blur.
     pub structure: f32,
-    /// Weight of the difference of a patch's fine contrast (mean standard deviation of 4x4 pixels): SSIM's windows are too
-    /// wide to see a weave or a print fade.
+    /// Weight of the difference of a patch's fine contrast (mean standard deviation of 4x4 pixels): SSIM's windows are
+    /// too wide to notice a weave or a print fading.
     pub contrast: f32,
     /// Share of steps without the graph, so that the same weights serve the ablation.
     pub without_space: f64,
     /// Decay of the weights, relative to the rate (Loshchilov and Hutter 2019).
     pub decay: f32,
-    /// Whether a sample comes in another variation each time: colour channels swapped and darkened, left and right turned.
+    /// Whether samples are augmented: colour channels swapped and darkened, left and right mirrored.
     pub vary: bool,
 }
 
@@ -77,35 +78,33 @@ pub struct Loss {
     pub step: u64,
     /// Mean squared sRGB difference.
     pub mse: f64,
-    /// The same of direct appearance.
+    /// Mean squared sRGB difference of direct appearance.
     pub direct_mse: f64,
 }
 
-/// The state of a training: everything that the next step depends on.
+/// State of a training: everything that the next step depends on.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Trainer {
-    /// What is being trained.
+    /// Trained parameters.
     pub parameters: Parameters,
-    /// How.
+    /// Settings.
     pub settings: TrainSettings,
-    /// Steps done.
+    /// Completed steps.
     pub step: u64,
-    /// Where.
-    pub device: NetworkDevice,
     /// Mean and mean square of each gradient.
     moments: BTreeMap<String, Moments>,
 }
 
 impl Trainer {
-    /// Starts from these weights.
+    /// Starts a training from these weights.
     #[must_use]
     pub fn new(parameters: Parameters, settings: TrainSettings) -> Self {
         let zeros = |count: usize| [vec![0.0; count], vec![0.0; count]];
         let moments = parameters.by_name.iter().map(|(name, p)| (name.clone(), zeros(p.values.len()))).collect();
-        Self { parameters, settings, step: 0, device: NetworkDevice::processor(), moments }
+        Self { parameters, settings, step: 0, moments }
     }
 
-    /// Place of the sample that the next step wants, out of `count`: every sample once a round, in random order.
+    /// Returns the index of the next step's sample among `count`: every sample once per round, in random order.
     #[must_use]
     pub fn next_sample(&self, count: usize) -> usize {
         if count == 0 {
@@ -117,7 +116,7 @@ impl Trainer {
         order[place as usize]
     }
 
-    /// One step on one sample. A step whose loss or gradient is not finite changes nothing but the count.
+    /// Performs one step on one sample. A step with a non-finite loss or gradient changes nothing but the count.
     pub fn step(&mut self, sample: &TrainingSample) -> Option<Loss> {
         let mut rng =
             SmallRng::seed_from_u64(self.settings.seed.wrapping_add(self.step.wrapping_mul(0x2545_f491_4f6c)));
@@ -137,14 +136,14 @@ impl Trainer {
         Some(Loss { step, mse: loss.mse, direct_mse: loss.direct_mse })
     }
 
-    /// The loss and dL/d parameters.
+    /// Computes the loss and dL/d parameters.
     fn gradients(
         &self,
         sample: &TrainingSample,
-        target: &Target,
+        target: &TargetPixels,
         variation: Variation,
     ) -> Option<(PixelLoss, BTreeMap<String, Vec<f32>>)> {
-        let device = self.device.0.clone().autodiff();
+        let device = Device::flex().autodiff();
         let tensors = self.parameters.tensors(&device, true);
         let network = Network { device, size: self.parameters.size, tensors };
         let levels = network.encode(planes(&network, sample, variation));
@@ -203,7 +202,7 @@ impl Trainer {
         }
     }
 
-    /// Writes everything that the next step depends on, whole or not at all.
+    /// Writes the state atomically.
     ///
     /// # Errors
     /// [`StfaError::File`].
@@ -218,7 +217,7 @@ impl Trainer {
         file.write(path, self.parameters.metadata(&card))
     }
 
-    /// Goes on where [`Self::save`] left off.
+    /// Resumes from a state written by [`Self::save`].
     ///
     /// # Errors
     /// [`StfaError::File`], [`StfaError::Weights`] for a damaged checkpoint.
@@ -242,7 +241,7 @@ impl Trainer {
             let get = |what: &str| array(&file, &format!("{what}.{name}"), &shape).map_err(refuse);
             moments.insert(name.clone(), [get("mean")?, get("square")?]);
         }
-        Ok(Self { parameters, settings, step, device: NetworkDevice::processor(), moments })
+        Ok(Self { parameters, settings, step, moments })
     }
 }
 

@@ -1,4 +1,4 @@
-//! Another look of a sample at every step: colour channels swapped and darkened, left and right turned.
+//! Augmentation of samples: colour channels swapped and darkened, left and right mirrored.
 
 use rand::{RngExt as _, rngs::SmallRng, seq::SliceRandom as _};
 
@@ -8,15 +8,15 @@ use crate::{
     train::TrainSettings,
 };
 
-/// How a sample is shown to the networks.
+/// Augmentation of one step.
 #[derive(Debug, Clone, Copy)]
 pub(crate) struct Variation {
     pub(crate) channels: [usize; 3],
     /// Factor on the sRGB values of each channel, at most 1.
     pub(crate) gain: [f32; 3],
-    /// Left and right turned.
+    /// Whether left and right are mirrored.
     pub(crate) flip: bool,
-    /// With the graph.
+    /// Whether the graph network is used.
     pub(crate) space: bool,
 }
 
@@ -49,7 +49,7 @@ impl Variation {
         out
     }
 
-    /// The same of a Gaussian's state, whose first triple is linear.
+    /// Applies the colours' augmentation to a Gaussian's state, whose first triple is linear.
     pub(crate) fn state(&self, row: &[f32; STATE]) -> [f32; STATE] {
         let mut out = self.row(row, &CANDIDATE_PLACES);
         for c in 0..3 {
@@ -64,7 +64,7 @@ impl Variation {
     }
 }
 
-/// Where the candidates stand in a state.
+/// Offsets of the candidates in a state.
 const CANDIDATE_PLACES: [usize; CANDIDATES] = {
     let mut places = [0; CANDIDATES];
     let mut i = 0;

@@ -1,4 +1,4 @@
-//! Weights files: safetensors with a card that tells where they come from.
+//! Weights files: safetensors with a card of their provenance.
 
 use std::{collections::HashMap, path::Path};
 
@@ -10,20 +10,20 @@ use crate::{
     tensor_file::{TensorFile, array, read},
 };
 
-/// Version of the networks: a file of another one cannot be used.
+/// Version of the networks; files of other versions are rejected.
 pub const WEIGHTS_VERSION: u32 = 1;
 
-/// Weights that come along, by name: the first are used where nothing else is asked for.
+/// Bundled weights by name; the first are the default.
 pub const EMBEDDED: [(&str, &[u8]); 2] = [
     ("small", include_bytes!("../weights/small.safetensors")),
     ("tiny", include_bytes!("../weights/tiny.safetensors")),
 ];
 
-/// Largest sensible number of channels, heads, layers: what a damaged file may not exceed.
+/// Largest accepted number of channels, heads and layers, against damaged files.
 const MAX_SIZE: usize = 4096;
 
 impl Parameters {
-    /// Writes the weights; `card` is JSON of the user's choice (data, seeds, command, scores).
+    /// Writes the weights; `card` is free-form JSON (data, seeds, command, scores).
     ///
     /// # Errors
     /// [`StfaError::File`].
@@ -33,7 +33,7 @@ impl Parameters {
         file.write(path, self.metadata(card))
     }
 
-    /// Returns a number that differs for other weights: FNV-1a of all values in the order of their names.
+    /// Returns a hash of the weights: FNV-1a of all values in the order of their names.
     #[must_use]
     pub fn digest(&self) -> u64 {
         let values = self.by_name.values().flat_map(|parameter| &parameter.values);
@@ -57,11 +57,11 @@ impl Parameters {
         ])
     }
 
-    /// The weights that come with this version, by the name of one of [`EMBEDDED`] (`renderer/stfa/weights` has cards that tell how they
-    /// were made), or those of a file.
+    /// Loads bundled weights by a name of [`EMBEDDED`] (`renderer/stfa/weights` has cards with their provenance), or
+    /// those of a file.
     ///
     /// # Errors
-    /// [`StfaError::File`]; [`StfaError::Weights`] for a file that is cut short, of another version or another network.
+    /// [`StfaError::File`]; [`StfaError::Weights`] for a file that is truncated, of another version or another network.
     pub fn named(name_or_file: &Path) -> Result<Self, StfaError> {
         match EMBEDDED.iter().find(|(name, _)| name_or_file.as_os_str() == *name) {
             Some((name, bytes)) => Self::from_bytes(name, bytes),
@@ -72,7 +72,7 @@ impl Parameters {
     /// Reads weights from a file.
     ///
     /// # Errors
-    /// [`StfaError::File`]; [`StfaError::Weights`] for a file that is cut short, of another version or another network.
+    /// [`StfaError::File`]; [`StfaError::Weights`] for a file that is truncated, of another version or another network.
     pub fn load(path: &Path) -> Result<Self, StfaError> {
         Self::from_bytes(&path.display().to_string(), &read(path)?)
     }
@@ -111,7 +111,7 @@ impl Parameters {
     }
 }
 
-/// Metadata of a safetensors file.
+/// Reads the metadata of a safetensors file.
 pub(crate) fn header(bytes: &[u8]) -> Result<HashMap<String, String>, String> {
     let (_, metadata) = SafeTensors::read_metadata(bytes).map_err(|error| error.to_string())?;
     Ok(metadata.metadata().clone().unwrap_or_default())

@@ -89,7 +89,7 @@ impl Stage {
         rgba8_from_target(&target.color.read(&self.gpu).unwrap())
     }
 
-    /// What direct appearance paints and observes.
+    /// Runs direct appearance and returns its colours and observations.
     fn update(
         &mut self,
         cameras: &[Camera],
@@ -107,7 +107,7 @@ impl Stage {
                 camera,
                 picture,
                 canonical: &target.canonical,
-                drawn: &target.color,
+                rendered: &target.color,
                 gaussians: None,
             })
             .collect();
@@ -234,38 +234,4 @@ fn some_gaussians_are_gathered_as_all_are() {
     assert_eq!(some.nodes, all.nodes);
     let error = frame_inputs(&body, &observed, &crops, &settings, Some(&[5000])).unwrap_err().to_string();
     assert!(error.contains("Gaussian 5000 of 5000"), "{error}");
-}
-
-#[test]
-#[cfg(not(feature = "wgpu"))]
-fn networks_on_the_adapter_are_refused_in_words_where_they_were_left_out() {
-    let stage = Stage::new();
-    let parameters = Parameters::untrained(NetworkSize::TINY, 1);
-    let error = flyrig_stfa::SharedAppearance::new(&stage.gpu, &parameters, &stage.body()).unwrap_err().to_string();
-    assert!(error.contains("built without") && error.contains("gpu-networks"), "{error}");
-}
-
-#[test]
-#[cfg(feature = "wgpu")]
-fn networks_on_the_adapter_paint_what_those_on_the_processor_paint() {
-    let mut stage = Stage::new();
-    let settings = AppearanceSettings::default();
-    let parameters = Parameters::named("small".as_ref()).unwrap();
-    let mut plain = LearnedAppearance::new(&parameters, stage.body());
-    let mut shared = flyrig_stfa::SharedAppearance::new(&stage.gpu, &parameters, &stage.body()).unwrap();
-    for frame in 0..4 {
-        let cameras = [0.0, 2.1, 4.2].map(|a| Stage::camera(a + 0.5 * f64::from(frame)));
-        let cameras = &cameras[..if frame == 2 { 2 } else { 3 }];
-        let pictures: Vec<_> = cameras.iter().map(|camera| stage.picture(camera, frame as f32)).collect();
-        let (direct, observed) = stage.update(cameras, &pictures, &settings);
-        let expected = plain.paint(&observed, &views(&pictures), &settings).unwrap();
-        shared.paint(&stage.gpu, &stage.appearance, &stage.buffers, &views(&pictures), &settings).unwrap();
-        let found = stage.buffers.color.read(&stage.gpu).unwrap();
-        stage.buffers.color.write(&stage.gpu, &direct);
-        let apart = |a: &[[f32; 4]], b: &[[f32; 4]]| -> f32 {
-            a.as_flattened().iter().zip(b.as_flattened()).map(|(a, b)| (a - b).abs()).fold(0.0, f32::max)
-        };
-        assert!(apart(&expected, &found) < 1e-3, "frame {frame}: {}", apart(&expected, &found));
-        assert!(apart(&direct, &found) > 0.01, "frame {frame}: the networks added nothing");
-    }
 }

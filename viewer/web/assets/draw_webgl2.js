@@ -1,4 +1,4 @@
-// Draws Gaussians with WebGL2, as renderer/renderer/src/raster_project.wgsl and raster_blend.wgsl do: EWA projection, Mip filter, blending in
+// Draws Gaussians with WebGL2, as project.wgsl and blend.wgsl of renderer/renderer/src/raster do: EWA projection, Mip filter, blending in
 // linear light. Gaussians come sorted, farthest first.
 
 const TEXELS = 1024; // Gaussians in a row of the data textures

@@ -1,5 +1,5 @@
-// Draws Gaussians with WebGPU by the rig's own kernels (kernels.json is made of renderer/renderer/src/*.wgsl): projection, stable sort by depth,
-// lists by tile, blending. Numbers of bindings and the order of dispatches are those of renderer/renderer/src/raster_device.rs.
+// Draws Gaussians with WebGPU by the rig's own kernels (kernels.json is made of the WGSL in renderer/renderer/src): projection, stable sort by depth,
+// lists by tile, blending. Numbers of bindings and the order of dispatches are those of renderer/renderer/src/raster/device.rs.
 
 const SLOT_BYTES = 256; // constants lie this far apart: offsets of bindings may be any multiple of it
 const MOST_GROUPS = 65535; // workgroups of a dispatch in one dimension
@@ -161,7 +161,7 @@ export class WebGpuDrawing {
       const [table, extremes, valid] = ["Table", "Extremes", "Valid"].map(part => own[name + part]);
       let [from, to] = [own[`${name}Elements`], own[`${name}Other`]];
       for (let index = 0; index < passes; index++) {
-        const settings = constant(new Uint32Array([elements, index, isScaled ? 1 : 0, 0])); // struct SortPass of sort.wgsl
+        const settings = constant(new Uint32Array([elements, index, isScaled ? 1 : 0, 0])); // struct SortPass of radix.wgsl
         if (index === 0 && isScaled) step("find_range", { 0: settings, 1: from, 2: extremes }, groups);
         const known = { 0: settings, 1: from, 2: extremes, 3: table, 4: valid };
         step("count_digits", known, groups);

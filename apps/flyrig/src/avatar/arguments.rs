@@ -139,9 +139,6 @@ pub struct BuildArgs {
     /// Whether to correct the weights by which the bones move each Gaussian.
     #[arg(long, default_value_t = false, action = clap::ArgAction::Set)]
     pub skin_correction: bool,
-    /// Whether parts of images whose error does not change any more are drawn less often.
-    #[arg(long, default_value_t = false, action = clap::ArgAction::Set)]
-    pub rest: bool,
     /// How the avatar is learnt.
     #[arg(long, value_enum, default_value = "direct")]
     pub method: Method,

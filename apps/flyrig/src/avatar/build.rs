@@ -6,9 +6,7 @@ use std::{
 };
 
 use anyhow::{Context as _, Result, ensure};
-use flyrig_avatar::{
-    AtlasLayout, Avatar, AvatarScene, Bones, Card, Drawn, ErrorWeights, Fit, FitSettings, LocalSettings,
-};
+use flyrig_avatar::{AtlasLayout, Avatar, AvatarScene, Bones, Card, ErrorWeights, Fit, FitSettings, LocalSettings};
 use flyrig_fusion::BodySettings;
 use flyrig_gpu::GpuContext;
 use flyrig_renderer::HarmonicOrder;
@@ -74,7 +72,6 @@ pub fn build(args: &BuildArgs, gpu: &GpuContext) -> Result<()> {
             light: args.light,
             refine_poses: args.refine_poses,
             skin_correction: args.skin_correction,
-            rest: args.rest,
             weights: ErrorWeights { sharpness: args.sharpen, ..ErrorWeights::default() },
             ..FitSettings::default()
         },
@@ -126,13 +123,6 @@ pub fn build(args: &BuildArgs, gpu: &GpuContext) -> Result<()> {
         println!("stopped after {done} of {total} steps; the same command goes on from there");
     }
     let seconds = fitting.elapsed().as_secs_f64();
-    let Drawn { images, left_out, rows: [rows, all] } = fit.drawn();
-    if left_out > 0 || rows < all {
-        println!(
-            "{images} images drawn and {left_out} left out, {:.0} % of the rows drawn, as their errors did not change",
-            100.0 * rows as f64 / all.max(1) as f64
-        );
-    }
     let training_db = fit.decibels(&avatar)?;
     avatar.card = Card {
         name: args.take.dataset.file_name().map_or_else(String::new, |name| name.to_string_lossy().into_owned()),

@@ -1,40 +1,42 @@
-//! Which texels of the atlas colour each Gaussian (LoGAvatar Eq. 14), and a first atlas from the colours of the Gaussians.
+//! Mapping of Gaussians to the texels of the atlas that colour them (LoGAvatar Eq. 14), and a first atlas from the
+//! Gaussians' colours.
 
 use flyrig_renderer::HarmonicOrder;
 use glam::{Vec2, Vec3};
 use rayon::prelude::*;
 
-use crate::{AvatarError, parameters::Element};
+use crate::error::AvatarError;
+use crate::model::parameters::Element;
 
-/// How the surface lies in the atlas.
+/// Layout of the surface in the atlas.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
 pub enum AtlasLayout {
-    /// By the body's texture coordinates.
+    /// Texture coordinates of the body.
     #[default]
     Uv,
-    /// Seen from the front and from the back: two charts, split at the mean depth.
+    /// Front and back views: two charts, split at the mean depth.
     FrontBack,
 }
 
 /// Border of the charts of front and back, texels.
 const BORDER: f32 = 2.0;
 
-/// Four texels and their shares.
+/// Bilinear sample: four texels and their weights.
 type Taps = [(u32, f32); 4];
 
-/// Places of the Gaussians in an atlas.
+/// Positions of the Gaussians in an atlas.
 #[derive(Debug, Clone, PartialEq)]
 pub(super) struct AtlasMap {
-    /// Square charts.
+    /// Number of square charts.
     pub charts: usize,
     /// Texels along a side.
     pub side: usize,
-    /// Of each Gaussian.
+    /// Bilinear sample of each Gaussian.
     pub taps: Vec<Taps>,
 }
 
 impl AtlasMap {
-    /// Of Gaussians at canonical `places` with texture coordinates `uvs`.
+    /// Maps Gaussians at canonical `places` with texture coordinates `uvs`.
     pub fn new(layout: AtlasLayout, places: &[Vec3], uvs: &[Vec2], side: usize) -> Result<Self, AvatarError> {
         let side = side.max(1);
         let (charts, points) = match layout {
@@ -53,13 +55,13 @@ impl AtlasMap {
         Ok(Self { charts, side, taps: points.into_iter().map(|(chart, point)| taps(chart, point, side)).collect() })
     }
 
-    /// Texels of a chart.
+    /// Returns the number of texels of a chart.
     pub fn texels(&self) -> usize {
         self.side * self.side
     }
 
-    /// Atlas of linear RGB coefficients (chart, channel, row, column) whose query gives about these harmonics of order 0. Texels that no
-    /// Gaussian touches get the colour around.
+    /// Returns an atlas of linear RGB coefficients (chart, channel, row, column) whose samples approximate these
+    /// harmonics of order 0. Texels that no Gaussian touches get the colour around them.
     pub fn splat(&self, harmonics: &[Element], order: HarmonicOrder) -> Vec<f32> {
         let texels = self.texels();
         let mut sums = vec![[0.0f64; 4]; self.charts * texels];
@@ -80,7 +82,7 @@ impl AtlasMap {
         (0..self.charts * 3 * texels).map(value).collect()
     }
 
-    /// Adds an atlas of `channels` channels, as many as three for each coefficient, to the harmonics.
+    /// Adds the samples of an atlas to the harmonics; `channels` is three per coefficient.
     pub fn query(&self, atlas: &[f32], channels: usize, harmonics: &mut [Element], coefficients: usize) {
         let texels = self.texels();
         harmonics.par_chunks_mut(coefficients).zip(&self.taps).with_min_len(1024).for_each(|(rows, taps)| {
@@ -94,7 +96,8 @@ impl AtlasMap {
         });
     }
 
-    /// Derivatives with respect to the atlas from those with respect to the harmonics, summed in the order of the Gaussians.
+    /// Returns the derivatives with respect to the atlas from those with respect to the harmonics, summed in the order
+    /// of the Gaussians.
     pub fn backward(&self, slopes: &[Element], coefficients: usize) -> Vec<f32> {
         let (texels, channels) = (self.texels(), 3 * coefficients);
         let mut atlas = vec![0.0; self.charts * channels * texels];
@@ -131,7 +134,7 @@ fn taps(chart: usize, point: Vec2, side: usize) -> Taps {
     ]
 }
 
-/// Chart and texel of each place: canonical x to the right and y up, both charts at one scale.
+/// Returns chart and texel of each position: canonical x to the right and y up, both charts at one scale.
 fn front_back(places: &[Vec3], side: usize) -> Vec<(usize, Vec2)> {
     let mean = places.iter().map(|place| f64::from(place.z)).sum::<f64>() / places.len().max(1) as f64;
     let lowest = places.iter().copied().reduce(Vec3::min).unwrap_or_default().truncate();
@@ -148,7 +151,7 @@ fn front_back(places: &[Vec3], side: usize) -> Vec<(usize, Vec2)> {
         .collect()
 }
 
-/// Fills empty texels from those beside them, ring by ring.
+/// Fills empty texels from their neighbours, ring by ring.
 fn fill(sums: &mut [[f64; 4]], side: usize) {
     for chart in sums.chunks_mut(side * side) {
         let mut empty: Vec<usize> = (0..chart.len()).filter(|i| chart[*i][3] <= 0.0).collect();

@@ -3,10 +3,11 @@
 use glam::Vec3;
 use rayon::prelude::*;
 
-/// An empty place in a group.
+/// Index of an empty slot in a group.
 pub(super) const NOBODY: u32 = u32::MAX;
 
-/// First `count` places in the order of farthest-point sampling: each is as far as possible from those before it. Starts at the first place.
+/// Selects `count` positions by farthest-point sampling: each is as far as possible from those before it. Starts at the
+/// first position.
 pub(super) fn farthest(places: &[Vec3], count: usize) -> Vec<u32> {
     let mut order = Vec::with_capacity(count.min(places.len()));
     let mut away = vec![f32::INFINITY; places.len()];
@@ -31,17 +32,17 @@ pub(super) fn farthest(places: &[Vec3], count: usize) -> Vec<u32> {
     order
 }
 
-/// Gaussians of one stage, by the inputs of its networks.
+/// Gaussians of one stage, grouped by the inputs of its networks.
 #[derive(Debug, Clone, PartialEq)]
 pub(super) struct Groups {
-    /// Places in each group: the size of the largest one.
+    /// Slots per group: the size of the largest one.
     pub slots: usize,
-    /// Gaussians of all groups one after another, [`NOBODY`] in empty places.
+    /// Concatenated groups of Gaussians, [`NOBODY`] in empty slots.
     pub members: Vec<u32>,
 }
 
 impl Groups {
-    /// Assigns each of `gaussians` to the nearest of `inputs`, both indices of places.
+    /// Assigns each of `gaussians` to the nearest of `inputs`, both indices of `places`.
     pub fn new(places: &[Vec3], inputs: &[u32], gaussians: &[u32]) -> Self {
         let nearest = |gaussian: &u32| {
             let own = places[*gaussian as usize];
@@ -60,7 +61,7 @@ impl Groups {
         Self { slots, members: groups.concat() }
     }
 
-    /// Cells that hold a Gaussian, and which.
+    /// Returns the slots that hold a Gaussian, with its index.
     pub fn cells(&self) -> impl Iterator<Item = (usize, usize)> + '_ {
         self.members.iter().enumerate().filter(|(_, g)| **g != NOBODY).map(|(cell, g)| (cell, *g as usize))
     }

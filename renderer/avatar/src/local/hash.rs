@@ -1,23 +1,23 @@
-//! Multiresolution hash encoding of places: features of eight corners of the cell around a place, blended trilinearly, at several
-//! resolutions. Indices and weights are computed once, since the places seldom change.
+//! Multiresolution hash encoding of positions: features of the eight corners of the cell around a position,
+//! interpolated trilinearly, at several resolutions. Indices and weights are cached, since positions seldom change.
 
 use glam::Vec3;
 use rayon::prelude::*;
 
-/// Resolutions.
+/// Number of resolutions.
 pub(super) const LEVELS: usize = 8;
-/// Features of one resolution.
+/// Features per resolution.
 pub(super) const FEATURES: usize = 2;
-/// Features of a place: the 16 of the paper.
+/// Features per position: the 16 of the paper.
 pub(super) const WIDTH: usize = LEVELS * FEATURES;
-/// Rows of one resolution's table.
+/// Rows per resolution's table.
 pub(super) const ROWS: usize = 1 << 14;
-/// Cells along the longest side of the body at the coarsest resolution, and by how much each finer one has more: the finest cells are 7 mm
-/// wide on an adult.
+/// Cells along the longest side of the body at the coarsest resolution, and growth factor per level: the finest cells
+/// are 7 mm wide on an adult.
 const COARSEST: f32 = 16.0;
 const GROWTH: f32 = 1.5;
 
-/// Box that is encoded.
+/// Encoded box.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub(super) struct Box3 {
     lowest: Vec3,
@@ -25,7 +25,7 @@ pub(super) struct Box3 {
 }
 
 impl Box3 {
-    /// Around places that are finite; a metre where there are none.
+    /// Encloses the finite positions; one metre without any.
     pub fn around(places: &[Vec3]) -> Self {
         let finite = || places.iter().copied().filter(|place| place.is_finite());
         let lowest = finite().reduce(Vec3::min).unwrap_or(Vec3::ZERO);
@@ -34,7 +34,7 @@ impl Box3 {
     }
 }
 
-/// Row of a corner in a table of one resolution: counted through where all corners have room, mixed otherwise.
+/// Returns the row of a corner in a resolution's table: a dense index where all corners fit, a hash otherwise.
 pub(super) fn row(level: usize, [x, y, z]: [u32; 3]) -> usize {
     let side = cells(level) as u32 + 2;
     if u64::from(side).pow(3) <= ROWS as u64 {
@@ -49,18 +49,18 @@ pub(super) fn cells(level: usize) -> f32 {
     COARSEST * GROWTH.powi(level as i32)
 }
 
-/// Corners of one place at one resolution: rows of the table and their shares.
+/// Corners of one position at one resolution: rows of the table and their weights.
 type Corners = [(u32, f32); 8];
 
-/// Places as they are looked up.
+/// Encoding of a list of positions.
 #[derive(Debug, Clone, Default, PartialEq)]
 pub(super) struct HashEncoding {
-    /// [`LEVELS`] for each place.
+    /// Corners, [`LEVELS`] per position.
     pub corners: Vec<Corners>,
 }
 
 impl HashEncoding {
-    /// Of places; those outside of the box are drawn to its sides.
+    /// Encodes positions; those outside of the box are clamped to its sides.
     pub fn new(places: &[Vec3], around: Box3) -> Self {
         let of = |at: usize| {
             let (place, level) = (places[at / LEVELS], at % LEVELS);
@@ -78,7 +78,7 @@ impl HashEncoding {
         Self { corners: (0..places.len() * LEVELS).into_par_iter().with_min_len(1024).map(of).collect() }
     }
 
-    /// Features of all places, [`WIDTH`] each, from the tables of all resolutions one after another.
+    /// Computes the features of all positions, [`WIDTH`] each, from the concatenated tables of all resolutions.
     pub fn encode(&self, tables: &[f32]) -> Vec<f32> {
         let mut features = vec![0.0; self.corners.len() * FEATURES];
         features.par_chunks_mut(FEATURES).zip(&self.corners).enumerate().with_min_len(1024).for_each(
@@ -93,7 +93,8 @@ impl HashEncoding {
         features
     }
 
-    /// Derivatives with respect to the tables from those with respect to the features. Each resolution is summed in the order of places.
+    /// Returns the derivatives with respect to the tables from those with respect to the features. Each resolution is
+    /// summed in the order of positions.
     pub fn backward(&self, slopes: &[f32]) -> Vec<f32> {
         let mut tables = vec![0.0; LEVELS * ROWS * FEATURES];
         tables.par_chunks_mut(ROWS * FEATURES).enumerate().for_each(|(level, table)| {
@@ -115,7 +116,7 @@ mod tests {
 
     use super::*;
 
-    /// Features by the definition, in f64.
+    /// Computes features by the definition, in f64.
     fn reference(place: Vec3, around: Box3, tables: &[f64]) -> Vec<f64> {
         let mut features = Vec::new();
         for level in 0..LEVELS {

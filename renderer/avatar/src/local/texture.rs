@@ -5,18 +5,20 @@ use flyrig_learn::{
     burn_tensor::{Device, Tensor, activation, module, ops::ConvOptions},
 };
 
-use super::{atlas_map::AtlasMap, decoders::he};
+use crate::local::atlas_map::AtlasMap;
+use crate::local::decoders::he;
 
-/// Features of a texel of the neural texture.
+/// Features per texel of the neural texture.
 pub(super) const FEATURES: usize = 8;
 /// Channels of the encoder's hidden layers.
 pub(super) const HIDDEN: usize = 16;
-/// Spread of the neural texture at the start: little, or its noise shows where no image corrects it.
+/// Initial spread of the neural texture: small, since its noise remains visible where no image corrects it.
 const SPREAD: f32 = 0.05;
-/// Spread of the hidden layers' shifts: a texture without contrast has features too.
+/// Initial spread of the hidden layers' biases, so that a texture without contrast has features too.
 const SHIFT: f32 = 0.3;
 
-/// Parameters for an atlas of so many coefficients. The last layer is zero: nothing is added to the first atlas.
+/// Returns the parameters for an atlas of this many coefficients. The last layer is zero: nothing is added to the first
+/// atlas.
 pub(super) fn parameters(map: &AtlasMap, coefficients: usize) -> Vec<Start> {
     let mut list = vec![("texture".to_owned(), vec![map.charts, FEATURES, map.side, map.side], SPREAD)];
     let layers = [
@@ -31,7 +33,7 @@ pub(super) fn parameters(map: &AtlasMap, coefficients: usize) -> Vec<Start> {
     list
 }
 
-/// The atlas (chart, channel, row, column), without the first one.
+/// Computes the residual atlas (chart, channel, row, column).
 pub(super) fn encode(tensors: &Tensors, device: &Device) -> Tensor<4> {
     let conv = |x: Tensor<4>, layer: usize| {
         let weight = tensors.get(&format!("encoder.{layer}.weight"), device);

@@ -4,27 +4,28 @@ use flyrig_body::DeformationGraph;
 use flyrig_gpu::{ComputeKernel, GpuContext, StorageBuffer};
 use wgpu::{BindGroup, Buffer};
 
-use super::{AppearanceError, DiffusionHierarchy};
+use crate::appearance::hierarchy::DiffusionHierarchy;
+use crate::appearance::settings::AppearanceError;
 
-/// Constant but for the last two.
+/// Buffers of the graph; all but the last two are constant.
 #[derive(Debug)]
 pub(super) struct GraphBuffers {
-    /// Nodes of the finest level.
+    /// Number of nodes of the finest level.
     pub(super) node_count: u32,
     /// Nodes of each Gaussian and their weights.
     pub(super) gaussian_nodes: StorageBuffer<[u32; 4]>,
     pub(super) gaussian_weights: StorageBuffer<[f32; 4]>,
-    /// The reverse: first entry of each node, and Gaussian and weight of each entry.
+    /// Reverse map: first entry of each node, and Gaussian and weight of each entry.
     pub(super) entry_start: StorageBuffer<u32>,
     pub(super) entries: StorageBuffer<[u32; 2]>,
-    /// First node and number of nodes of each level; nodes of all levels are numbered through.
+    /// First node and number of nodes of each level; nodes of all levels are numbered consecutively.
     pub(super) levels: StorageBuffer<[u32; 4]>,
     /// Ranges of each node in `edges` and in `children`.
     pub(super) links: StorageBuffer<[u32; 4]>,
     pub(super) parents: StorageBuffer<u32>,
     pub(super) edges: StorageBuffer<[u32; 2]>,
     pub(super) children: StorageBuffer<u32>,
-    /// What was seen around each node.
+    /// Mean linear RGB seen around each node, and mean visibility.
     pub(super) node_seen: StorageBuffer<[f32; 4]>,
     /// Two copies of the diffused colours; the first holds the result.
     pub(super) node_color: StorageBuffer<[f32; 4]>,
@@ -79,7 +80,7 @@ impl GraphBuffers {
     }
 }
 
-/// Every Gaussian hangs on nodes that exist, with weights that are numbers.
+/// Checks that every Gaussian refers to existing nodes with finite weights.
 fn check_attachment(gaussians: usize, graph: &DeformationGraph) -> Result<(), AppearanceError> {
     let refuse = |message| Err(AppearanceError::Graph(message));
     let (nodes, weights) = (graph.gaussian_nodes.len(), graph.gaussian_weights.len());
@@ -98,7 +99,7 @@ fn check_attachment(gaussians: usize, graph: &DeformationGraph) -> Result<(), Ap
     Ok(())
 }
 
-/// First entry of each node (and the end), and the entries in the order of the Gaussians.
+/// Returns the first entry of each node (and the end), and the entries in the order of the Gaussians.
 fn reverse(graph: &DeformationGraph, node_count: usize) -> (Vec<u32>, Vec<[u32; 2]>) {
     let mut lists = vec![Vec::new(); node_count];
     for (gaussian, (nodes, weights)) in graph.gaussian_nodes.iter().zip(&graph.gaussian_weights).enumerate() {
@@ -124,7 +125,7 @@ struct Flat {
     children: Vec<u32>,
 }
 
-/// Numbers the nodes of all levels through.
+/// Numbers the nodes of all levels consecutively.
 fn flatten(hierarchy: &DiffusionHierarchy) -> Flat {
     let mut flat =
         Flat { levels: Vec::new(), links: Vec::new(), parents: Vec::new(), edges: Vec::new(), children: Vec::new() };

@@ -1,38 +1,38 @@
-//! Coarser and coarser versions of the deformation graph, so that colour crosses an unseen back in a few steps.
+//! Hierarchy of coarser versions of the deformation graph, so that colour crosses an unseen back in a few steps.
 
 use std::collections::BTreeMap;
 
 use flyrig_body::DeformationGraph;
 
-use super::AppearanceError;
+use crate::appearance::settings::AppearanceError;
 
-/// One level; level 0 are the graph's own nodes.
+/// One level; level 0 has the graph's own nodes.
 #[derive(Debug, Clone, PartialEq)]
 pub struct DiffusionLevel {
-    /// Neighbours of each node and how many edges of level 0 lie between the two; symmetric.
+    /// Neighbours of each node and the number of level-0 edges between the two; symmetric.
     pub edges: Vec<Vec<(u32, f32)>>,
     /// Node of the next level that each node belongs to; empty at the last level, which has one node.
     pub parent: Vec<u32>,
 }
 
-/// The levels, finest first.
+/// Levels of a deformation graph, finest first.
 ///
 /// A coarse node stands for a seed and its neighbours; edge weights add up (Galerkin with piecewise constant
-/// interpolation). The last level is one node that joins all parts, also those no edge connects.
+/// interpolation). The last level is one node that joins all parts, even unconnected ones.
 #[derive(Debug, Clone, PartialEq)]
 pub struct DiffusionHierarchy {
-    /// Finest first, at least one.
+    /// Levels, finest first, at least one.
     pub levels: Vec<DiffusionLevel>,
 }
 
 impl DiffusionHierarchy {
-    /// Damped Jacobi steps a level; even, so that the result ends where it began.
+    /// Damped Jacobi steps per level; even, so that the result ends in the first of the two copies.
     pub const RELAX_STEPS: u32 = 16;
 
-    /// How far a Jacobi step goes; below 1, or two nodes that see only each other would swap for ever.
+    /// Damping of a Jacobi step; below 1, or two nodes that see only each other would oscillate.
     pub const DAMPING: f32 = 0.8;
 
-    /// Levels of a graph with at least one node. Edges count in both directions, once.
+    /// Builds the levels of a graph with at least one node. Edges are undirected and counted once.
     ///
     /// # Errors
     /// [`AppearanceError::Graph`] when there is no node or an edge leads out of the graph.
@@ -79,8 +79,8 @@ impl DiffusionHierarchy {
     }
 }
 
-/// Cluster of each node, and how many clusters there are: seeds take their whole neighbourhood while it is free,
-/// the rest joins the cluster it has the strongest edge to. A graph with an edge always shrinks.
+/// Returns the cluster of each node, and the number of clusters: seeds take their whole neighbourhood while it is free,
+/// remaining nodes join the cluster with the strongest edge. A graph with an edge always shrinks.
 fn cluster(edges: &[Vec<(u32, f32)>]) -> (Vec<u32>, usize) {
     const FREE: u32 = u32::MAX;
     let mut parent = vec![FREE; edges.len()];

@@ -3,22 +3,23 @@
 use bytemuck::{Pod, Zeroable};
 use flyrig_gpu::{CAMERA_WGSL, ComputeKernel, GpuContext};
 
-use super::{AppearanceSettings, DiffusionHierarchy};
-use crate::linear_from_srgb;
+use crate::appearance::hierarchy::DiffusionHierarchy;
+use crate::appearance::settings::AppearanceSettings;
+use crate::color::linear_from_srgb;
 
-/// Threads a workgroup; 256 is the most that every adapter has.
+/// Threads per workgroup; 256 is the most that every adapter supports.
 pub(super) const WORKGROUP: u32 = 256;
 
-/// Closer to the camera's plane nothing is projected, as in [`flyrig_types::Camera::project`].
+/// Distance from the camera's plane below which nothing is projected, metres, as in [`flyrig_types::Camera::project`].
 pub(super) const NEAR_M: f32 = 1e-3;
 
-/// Less than half covered by Gaussians, a pixel shows no surface to compare with.
+/// Coverage by Gaussians below which a pixel shows no surface to compare with.
 pub(super) const MIN_RENDERED_ALPHA: f32 = 0.5;
 
-/// A sample with less of the person in it says nothing: its colour would be rounding errors of a sliver.
+/// Mask coverage below which a sample is ignored: its colour would be dominated by rounding errors.
 pub(super) const MIN_COVERAGE: f32 = 0.01;
 
-/// The baseline's small number: far below the weight of a visible view, far above rounding.
+/// Extra weight of every view in the baseline: far below the weight of a visible view, far above rounding.
 const BASELINE_VIEW_WEIGHT: f32 = 1e-3;
 
 /// Layout of `struct Settings` in the WGSL (std430, 36 bytes).
@@ -37,7 +38,7 @@ pub(super) struct SettingsConstants {
 }
 
 impl SettingsConstants {
-    /// `painted`: whether there are colours of an earlier frame.
+    /// Converts the settings; `painted` is whether colours of an earlier frame exist.
     pub(super) fn new(settings: &AppearanceSettings, painted: bool) -> Self {
         Self {
             occlusion_per_m: settings.occlusion_per_m,
@@ -54,14 +55,14 @@ impl SettingsConstants {
 }
 
 #[derive(Debug)]
-pub(super) struct Kernels {
+pub(super) struct AppearanceKernels {
     pub(super) observe: ComputeKernel,
     pub(super) gather: ComputeKernel,
     pub(super) diffuse: ComputeKernel,
     pub(super) paint: ComputeKernel,
 }
 
-impl Kernels {
+impl AppearanceKernels {
     pub(super) fn new(gpu: &GpuContext) -> Self {
         let [observe, gather, diffuse, paint] =
             sources().map(|(name, source)| ComputeKernel::new(gpu, name, &[&source], "main"));
@@ -69,7 +70,7 @@ impl Kernels {
     }
 }
 
-/// Name and whole WGSL of each kernel.
+/// Returns name and complete WGSL of each kernel.
 fn sources() -> [(&'static str, String); 4] {
     let constants = format!(
         "const WORKGROUP: u32 = {WORKGROUP}u;\nconst NEAR_M: f32 = {NEAR_M:?};\n\

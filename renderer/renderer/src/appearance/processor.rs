@@ -1,38 +1,41 @@
-//! The kernels of direct appearance on the processor. Threads share the Gaussians; every sum runs in the order of the WGSL.
+//! Native twins of the kernels of direct appearance. Threads share the Gaussians; every sum runs in the order of the
+//! WGSL.
 
 use flyrig_gpu::CameraConstants;
 use glam::{IVec2, Vec2, Vec3, Vec4};
 use rayon::prelude::*;
 
-use super::graph_buffers::GraphBuffers;
-use super::kernels::{MIN_COVERAGE, MIN_RENDERED_ALPHA, NEAR_M, SettingsConstants};
-use super::{DiffusionHierarchy, ViewInput};
-use crate::{GaussianBuffers, linear_from_srgb};
+use crate::appearance::graph_buffers::GraphBuffers;
+use crate::appearance::hierarchy::DiffusionHierarchy;
+use crate::appearance::kernels::{MIN_COVERAGE, MIN_RENDERED_ALPHA, NEAR_M, SettingsConstants};
+use crate::appearance::settings::ViewInput;
+use crate::buffers::GaussianBuffers;
+use crate::color::linear_from_srgb;
 
-/// Gaussians that one task paints.
+/// Gaussians per task.
 const CHUNK: usize = 2048;
 
-/// Observations of the views, an element a Gaussian.
-pub(super) struct Seen<'a> {
+/// Accumulated observations, one element per Gaussian.
+pub(super) struct ObservationSums<'a> {
     /// Sum of weight times linear RGB; sum of weights.
     pub seen: &'a mut [[f32; 4]],
     /// Sum of Eq. 6 weights; exp(-k d) of the closest view.
     pub quality: &'a mut [[f32; 2]],
-    /// Pixel, weight and exp(-k d) of this view alone; empty where nobody asked for it.
+    /// Pixel, weight and exp(-k d) of this view alone; empty where not requested.
     pub kept: &'a mut [[f32; 4]],
 }
 
-/// The images of one view.
+/// Images of one view.
 struct View<'a> {
     camera: CameraConstants,
     settings: &'a SettingsConstants,
     linear: &'a [f32],
     picture: &'a [u32],
     canonical: &'a [[f32; 4]],
-    drawn: &'a [[f32; 4]],
+    rendered: &'a [[f32; 4]],
 }
 
-/// The images of a view at one pixel.
+/// Samples of a view's images at one position.
 struct Sample {
     pixel: Vec2,
     /// Linear RGB of the person's part.
@@ -42,24 +45,24 @@ struct Sample {
     shown: Vec4,
 }
 
-/// Adds what a view saw of every Gaussian (Eq. 5 to 8): `observe.wgsl`.
+/// Adds a view's observation of every Gaussian (Eq. 5 to 8): `observe.wgsl`.
 pub(super) fn observe(
     settings: &SettingsConstants,
     view: &ViewInput<'_>,
     gaussians: &GaussianBuffers,
     linear: &[f32],
-    Seen { seen, quality, kept }: Seen<'_>,
+    ObservationSums { seen, quality, kept }: ObservationSums<'_>,
 ) {
     let posed = view.gaussians.unwrap_or(gaussians);
     let (Some(center_scale), Some(normal)) = (posed.center_scale.slice(), posed.normal.slice()) else { return };
     let (Some(positions), Some(last)) = (gaussians.canonical.slice(), gaussians.color.slice()) else { return };
-    let (Some(picture), Some(canonical), Some(drawn)) =
-        (view.picture.slice(), view.canonical.slice(), view.drawn.slice())
+    let (Some(picture), Some(canonical), Some(rendered)) =
+        (view.picture.slice(), view.canonical.slice(), view.rendered.slice())
     else {
         return;
     };
-    let (picture, canonical, drawn) = (picture.as_slice(), canonical.as_slice(), drawn.as_slice());
-    let view = View { camera: CameraConstants::from(view.camera), settings, linear, picture, canonical, drawn };
+    let (picture, canonical, rendered) = (picture.as_slice(), canonical.as_slice(), rendered.as_slice());
+    let view = View { camera: CameraConstants::from(view.camera), settings, linear, picture, canonical, rendered };
     let mut kept: Vec<&mut [[f32; 4]]> = kept.chunks_mut(CHUNK).collect();
     kept.resize_with(seen.len().div_ceil(CHUNK), Default::default);
     let outs = seen.par_chunks_mut(CHUNK).zip(quality.par_chunks_mut(CHUNK));
@@ -86,7 +89,7 @@ pub(super) fn observe(
 }
 
 impl View<'_> {
-    /// Pixel, colour, weight of Eq. 6 with exp(-k d), and weight in the sum.
+    /// Observes a Gaussian in one view: pixel, colour, weight of Eq. 6 with exp(-k d), and weight in the sum.
     #[inline]
     fn observe(
         &self,
@@ -117,7 +120,7 @@ impl View<'_> {
         Some((pixel, color, [weight, nearness], weight + settings.view_weight * coverage))
     }
 
-    /// Looks a pixel up in all images; None outside of them and where too little of the person is seen.
+    /// Samples all images at a position; `None` outside of them and where too little of the person is seen.
     #[inline]
     fn sample(&self, pixel: Vec2) -> Option<Sample> {
         let size = IVec2::new(self.camera.size[0] as i32, self.camera.size[1] as i32);
@@ -142,13 +145,13 @@ impl View<'_> {
             color += belief * Vec3::new(channel(red), channel(green), channel(blue));
             coverage += belief;
             rendered += share * Vec4::from(self.canonical[index]);
-            shown += share * Vec4::from(self.drawn[index]);
+            shown += share * Vec4::from(self.rendered[index]);
         }
         let is_enough = coverage >= MIN_COVERAGE;
         is_enough.then(|| Sample { pixel, color: color / coverage, coverage, rendered, shown })
     }
 
-    /// Adds what drawing takes away: a Gaussian's image is its colour mixed with its neighbours'.
+    /// Adds the detail that rendering removes: a Gaussian's image is its colour mixed with its neighbours'.
     #[inline]
     fn sharpened(&self, color: Vec3, last: Vec3, shown: Vec4) -> Vec3 {
         let sharpness = self.settings.sharpness;
@@ -160,8 +163,8 @@ impl View<'_> {
     }
 }
 
-/// Eq. 7 in observation space. The sine through the cross product: sqrt(1 - cos^2) loses half the digits exactly where the
-/// weight is largest.
+/// Computes Eq. 7 in observation space. The sine comes from the cross product: sqrt(1 - cos^2) loses half the digits
+/// where the weight is largest.
 #[inline]
 fn angle_weight(normal: Vec3, camera_to_point: Vec3) -> f32 {
     // False for NaN.
@@ -171,7 +174,7 @@ fn angle_weight(normal: Vec3, camera_to_point: Vec3) -> f32 {
     if is_usable { 1.0 - (normal.cross(camera_to_point).length() / lengths).min(1.0) } else { 0.0 }
 }
 
-/// Visibility-weighted mean of the Gaussians around each node: `gather.wgsl`.
+/// Computes the visibility-weighted mean of the Gaussians around each node: `gather.wgsl`.
 pub(super) fn gather(graph: &GraphBuffers, seen: &[[f32; 4]]) {
     let (Some(entry_start), Some(entries)) = (graph.entry_start.slice(), graph.entries.slice()) else { return };
     let Some(mut node_seen) = graph.node_seen.slice_mut() else { return };
@@ -192,7 +195,7 @@ pub(super) fn gather(graph: &GraphBuffers, seen: &[[f32; 4]]) {
     });
 }
 
-/// Screened Laplace equation over the levels of the graph: `diffuse.wgsl`.
+/// Solves the screened Laplace equation over the levels of the graph: `diffuse.wgsl`.
 pub(super) fn diffuse(graph: &GraphBuffers, settings: &SettingsConstants) {
     let (Some(levels), Some(links), Some(parents)) = (graph.levels.slice(), graph.links.slice(), graph.parents.slice())
     else {
@@ -249,7 +252,7 @@ pub(super) fn diffuse(graph: &GraphBuffers, settings: &SettingsConstants) {
     }
 }
 
-/// Fills what was not seen (Eq. 9), remembers (Eq. 10) and blends with the memory (Eq. 11, 12): `paint.wgsl`.
+/// Inpaints unseen Gaussians (Eq. 9), updates the memory (Eq. 10) and blends with it (Eq. 11, 12): `paint.wgsl`.
 pub(super) fn paint(
     settings: &SettingsConstants,
     graph: &GraphBuffers,

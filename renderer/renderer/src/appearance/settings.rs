@@ -1,81 +1,64 @@
-//! What goes into direct appearance, and what can be wrong with it.
+//! Inputs, settings and errors of direct appearance.
 
-use crate::GaussianBuffers;
+use crate::buffers::GaussianBuffers;
 use flyrig_gpu::{GpuError, StorageBuffer};
 use flyrig_types::{Camera, CameraId, MAX_IMAGE_SIDE};
 
-/// What one camera saw at this instant.
+/// Input of one camera at this instant.
 #[derive(Debug, Clone, Copy)]
 pub struct ViewInput<'a> {
-    /// The camera that took the image, at the image's size.
+    /// Camera that took the image, at the image's size.
     pub camera: &'a Camera,
-    /// sRGB bytes, a pixel an element (red in the lowest byte), rows without padding; a: mask coverage, 255 on the person.
-    /// The colour is not multiplied by it.
+    /// sRGB bytes, one element per pixel (red in the lowest byte), rows without padding; alpha is the mask coverage,
+    /// 255 on the person. The colour is not multiplied by it.
     pub picture: &'a StorageBuffer<u32>,
-    /// The Gaussians' canonical positions as this camera sees them: [`RenderTarget::canonical`](crate::RenderTarget)
-    /// of a rendering with this very camera and the same Gaussians.
+    /// Canonical positions seen from this camera: [`RenderTarget::canonical`](crate::RenderTarget) of a rendering of
+    /// the same Gaussians with this camera.
     pub canonical: &'a StorageBuffer<[f32; 4]>,
-    /// The Gaussians with the colours of the last update as this camera sees them: [`RenderTarget::color`](crate::RenderTarget)
-    /// of the same rendering.
-    pub drawn: &'a StorageBuffer<[f32; 4]>,
-    /// The Gaussians as they stood when this image was taken, where that is another instant.
+    /// Colours of the last update seen from this camera: [`RenderTarget::color`](crate::RenderTarget) of the same
+    /// rendering.
+    pub rendered: &'a StorageBuffer<[f32; 4]>,
+    /// Gaussians posed at this image's time, where that differs from the frame's.
     pub gaussians: Option<&'a GaussianBuffers>,
 }
 
-/// What direct appearance found out in one update, read back: the input of learned appearance.
+/// Observations of one update, read back: the input of learned appearance.
 #[derive(Debug, Clone, PartialEq, Default)]
 pub struct Observations {
-    /// By view, by Gaussian: pixel x and y, weight of Eq. 6 (with the baseline's small number where nothing is filled
-    /// in), exp(-k d). All zero where the view has nothing to say.
+    /// Per view and Gaussian: pixel x and y, weight of Eq. 6 (with the baseline's extra weight where nothing is
+    /// inpainted), exp(-k d). All zero where the view does not show the Gaussian.
     pub views: Vec<Vec<[f32; 4]>>,
-    /// By Gaussian: sum of weight times linear RGB; sum of weights.
+    /// Per Gaussian: sum of weight times linear RGB; sum of weights.
     pub seen: Vec<[f32; 4]>,
-    /// By Gaussian: sum of the Eq. 6 weights, exp(-k d) of the best view.
+    /// Per Gaussian: sum of the Eq. 6 weights; exp(-k d) of the best view.
     pub quality: Vec<[f32; 2]>,
-    /// By graph node: mean linear RGB seen around it; mean visibility, 0 to 1.
+    /// Per graph node: mean linear RGB seen around it; mean visibility, 0 to 1.
     pub node_seen: Vec<[f32; 4]>,
-    /// By graph node: linear RGB diffused over the surface (old where nothing is filled in); w unused.
+    /// Per graph node: linear RGB diffused over the surface (stale where nothing is inpainted); w unused.
     pub node_color: Vec<[f32; 4]>,
 }
 
-/// [`Observations`] on the GPU, rows of the same meaning; buffers of nodes go on behind the last one.
-#[derive(Debug)]
-pub struct ObservationBuffers<'a> {
-    /// Of all views that there is room for, empty without [`DirectAppearance::keep_observations`](crate::DirectAppearance).
-    pub views: Vec<&'a StorageBuffer<[f32; 4]>>,
-    /// By Gaussian.
-    pub seen: &'a StorageBuffer<[f32; 4]>,
-    /// By Gaussian.
-    pub quality: &'a StorageBuffer<[f32; 2]>,
-    /// Number of graph nodes.
-    pub nodes: usize,
-    /// By graph node.
-    pub node_seen: &'a StorageBuffer<[f32; 4]>,
-    /// By graph node.
-    pub node_color: &'a StorageBuffer<[f32; 4]>,
-}
-
-/// How colours are gathered.
+/// Settings of direct appearance.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct AppearanceSettings {
-    /// Fill what no camera sees from its surroundings on the surface. Off: the paper's baseline, every camera that
-    /// has the point inside its image gets a small extra weight, visible or not.
+    /// Whether unseen Gaussians are inpainted from their surroundings on the surface. Off is the paper's baseline:
+    /// every camera that has the point inside its image gets a small extra weight, visible or not.
     pub space: bool,
-    /// Remember earlier frames. Off: neither the memory nor the last colours are read.
+    /// Whether earlier frames are remembered. Off: neither the memory nor the last colours are read.
     pub time: bool,
-    /// k of Eq. 8 and 11, per metre: beyond 1 / k a point counts as hidden.
+    /// k of Eq. 8 and 11, per metre: points at canonical distances beyond 1 / k count as occluded.
     pub occlusion_per_m: f32,
     /// w_max of Eq. 10.
     pub memory_weight_max: f32,
-    /// Mask coverage (0..1) up to which a pixel is not believed at all; above it belief rises linearly to 1.
+    /// Mask coverage (0..1) up to which a pixel is ignored; above it its weight rises linearly to 1.
     pub min_mask: f32,
     /// Weight of the colour diffused over the surface against a Gaussian's own observation, whose weight is w_vis
-    /// (0..=1): the larger, the smoother and the less detailed are badly seen regions.
+    /// (0..=1): larger values make poorly seen regions smoother and less detailed.
     pub inpaint_weight: f32,
-    /// Weight of the likeness of neighbouring graph nodes against a node's own observation (0..=1).
+    /// Weight of the smoothness between neighbouring graph nodes against a node's own observation (0..=1).
     pub smoothness: f32,
-    /// How much of what drawing blurs is put back into the colours, 0 to 0.95; detail that drawing wipes out wholly is
-    /// raised `1 / (1 - sharpness)` times.
+    /// Share of the detail lost by rendering that is restored, 0 to 0.95; detail that rendering removes entirely is
+    /// amplified `1 / (1 - sharpness)` times.
     pub sharpness: f32,
 }
 
@@ -116,49 +99,49 @@ impl AppearanceSettings {
     }
 }
 
-/// Why colours could not be gathered. Nothing was recorded then.
+/// Reason why an update was refused. Nothing was recorded then.
 #[derive(Debug, thiserror::Error)]
 pub enum AppearanceError {
-    /// The GPU refused.
+    /// The GPU reported an error.
     #[error(transparent)]
     Gpu(#[from] GpuError),
     /// A setting out of its range.
     #[error("appearance setting {name} is {value}, expected {expected}")]
     Setting {
-        /// Which.
+        /// Name of the setting.
         name: &'static str,
-        /// What was found.
+        /// Value found.
         value: f32,
-        /// What would be right.
+        /// Description of the valid range.
         expected: &'static str,
     },
     /// Gaussians and graph do not belong together.
     #[error("the deformation graph does not fit the Gaussians: {0}; build both from the same template")]
     Graph(String),
-    /// Other buffers than the ones announced.
+    /// The number of Gaussians differs from that at construction.
     #[error("appearance was made for {expected} Gaussians but is given {found}; make a new one for another body")]
     GaussianCount {
-        /// At construction.
+        /// Number at construction.
         expected: usize,
-        /// Now.
+        /// Number found.
         found: usize,
     },
-    /// More views than announced.
+    /// More views than at construction.
     #[error("appearance was made for {max} views but is given {found}; raise max_views")]
     TooManyViews {
-        /// At construction.
+        /// Number at construction.
         max: usize,
-        /// Now.
+        /// Number found.
         found: usize,
     },
-    /// An image that does not fit its camera.
+    /// An image does not fit its camera.
     #[error("camera {camera}: {what} has {found} {unit}, its {width}x{height} image needs {needed}")]
     ViewSize {
-        /// Which camera.
+        /// Name of the camera.
         camera: CameraId,
-        /// Which input.
+        /// Name of the input.
         what: &'static str,
-        /// What is counted.
+        /// Counted unit.
         unit: &'static str,
         /// Pixels.
         width: u32,
@@ -169,10 +152,10 @@ pub enum AppearanceError {
         /// Count found.
         found: usize,
     },
-    /// A camera without pixels, or with an absurd number of them.
+    /// A camera's image is empty or too large.
     #[error("camera {camera}: its image is {width}x{height}, expected 1 to {MAX_IMAGE_SIDE} pixels a side")]
     ImageSize {
-        /// Which camera.
+        /// Name of the camera.
         camera: CameraId,
         /// Pixels.
         width: u32,

@@ -1,26 +1,25 @@
-//! Buffers of direct appearance and the recording of one frame.
+//! Buffers of direct appearance and the recording of an update.
 
 use flyrig_body::{DeformationGraph, SurfaceGaussians};
 use flyrig_gpu::{CameraConstants, GpuContext, GpuError, GpuTimer, StorageBuffer, dispatch_1d};
 use flyrig_types::MAX_IMAGE_SIDE;
 use wgpu::{Buffer, BufferUsages, CommandEncoder, ComputePassDescriptor};
 
-use super::{
-    AppearanceError, AppearanceSettings, ObservationBuffers, Observations, ViewInput,
-    graph_buffers::GraphBuffers,
-    kernels::{Kernels, SettingsConstants, WORKGROUP},
-    processor::{self, Seen},
-};
-use crate::{GaussianBuffers, linear_from_srgb};
+use crate::appearance::graph_buffers::GraphBuffers;
+use crate::appearance::kernels::{AppearanceKernels, SettingsConstants, WORKGROUP};
+use crate::appearance::processor::{self, ObservationSums};
+use crate::appearance::settings::{AppearanceError, AppearanceSettings, Observations, ViewInput};
+use crate::buffers::GaussianBuffers;
+use crate::color::linear_from_srgb;
 
 const KEPT: &str = "observations of a view";
 
-/// Paints every Gaussian from the images of this instant and a memory of earlier ones.
+/// Painter of every Gaussian from the images of one instant and a memory of earlier ones.
 ///
-/// Buffers and pipelines are made once.
+/// Buffers and pipelines are created once.
 #[derive(Debug)]
 pub struct DirectAppearance {
-    /// None on the processor.
+    /// `None` on the processor.
     device: Option<DeviceKernels>,
     graph: GraphBuffers,
     linear_from_srgb: StorageBuffer<f32>,
@@ -28,27 +27,27 @@ pub struct DirectAppearance {
     kept: Vec<StorageBuffer<[f32; 4]>>,
     /// Sum of weight times linear RGB, sum of weights.
     seen: StorageBuffer<[f32; 4]>,
-    /// Sum of Eq. 6 weights, exp(-k d) of the best view.
+    /// Sum of Eq. 6 weights; exp(-k d) of the best view.
     quality: StorageBuffer<[f32; 2]>,
     /// Accumulated linear RGB and its weight.
     memory: StorageBuffer<[f32; 4]>,
     forget: bool,
 }
 
-/// The kernels on the device, and what they are uploaded.
+/// Kernels on the device and the buffers of their constants.
 #[derive(Debug)]
 struct DeviceKernels {
-    kernels: Kernels,
+    kernels: AppearanceKernels,
     settings: Buffer,
-    /// One a view.
+    /// One per view.
     cameras: Vec<Buffer>,
 }
 
 impl DirectAppearance {
-    /// For the Gaussians and graph of one body and at most `max_views` images a frame.
+    /// Creates the buffers for the Gaussians and graph of one body and at most `max_views` images per frame.
     ///
     /// # Errors
-    /// [`AppearanceError::Graph`] when the two do not fit, [`AppearanceError::Gpu`].
+    /// [`AppearanceError::Graph`] where the two do not fit, [`AppearanceError::Gpu`].
     pub fn new(
         gpu: &GpuContext,
         gaussians: &SurfaceGaussians,
@@ -66,7 +65,7 @@ impl DirectAppearance {
             })
         };
         let device = (!gpu.is_on_processor()).then(|| DeviceKernels {
-            kernels: Kernels::new(gpu),
+            kernels: AppearanceKernels::new(gpu),
             settings: constants("appearance settings", size_of::<SettingsConstants>()),
             cameras: (0..max_views).map(|_| constants("view camera", size_of::<CameraConstants>())).collect(),
         });
@@ -83,8 +82,8 @@ impl DirectAppearance {
         })
     }
 
-    /// Records the painting of [`GaussianBuffers::color`] (opacity 1) and uploads the cameras. Any number of views
-    /// up to the maximum will do; a camera that gave no image is left out of `views`.
+    /// Records the painting of [`GaussianBuffers::color`] (opacity 1) and uploads the cameras. `views` may have any
+    /// number of views up to the maximum; a camera without an image is left out.
     ///
     /// Submit the encoder before the next update: uploads take effect at the submission.
     ///
@@ -101,7 +100,7 @@ impl DirectAppearance {
         self.update_timed(gpu, encoder, gaussians, views, settings, None)
     }
 
-    /// [`Self::update`] with the time of its stages: `observe`, `gather`, `diffuse`, `paint`.
+    /// Records an update as [`Self::update`] does and measures its stages: `observe`, `gather`, `diffuse`, `paint`.
     ///
     /// # Errors
     /// As [`Self::update`].
@@ -158,7 +157,7 @@ impl DirectAppearance {
                     self.seen.raw().as_entire_binding(),
                     self.quality.raw().as_entire_binding(),
                     self.linear_from_srgb.raw().as_entire_binding(),
-                    view.drawn.raw().as_entire_binding(),
+                    view.rendered.raw().as_entire_binding(),
                     gaussians.color.raw().as_entire_binding(),
                     kept.raw().as_entire_binding(),
                 ];
@@ -190,13 +189,13 @@ impl DirectAppearance {
         Ok(())
     }
 
-    /// The kernels on the processor.
+    /// Runs the update on the processor.
     fn update_on_processor(&self, gaussians: &GaussianBuffers, views: &[ViewInput<'_>], settings: &SettingsConstants) {
         let (Some(mut seen), Some(mut quality)) = (self.seen.slice_mut(), self.quality.slice_mut()) else { return };
         let Some(linear) = self.linear_from_srgb.slice() else { return };
         for (view, kept) in views.iter().zip(&self.kept) {
             let Some(mut kept) = kept.slice_mut() else { return };
-            let out = Seen { seen: &mut seen, quality: &mut quality, kept: &mut kept };
+            let out = ObservationSums { seen: &mut seen, quality: &mut quality, kept: &mut kept };
             processor::observe(settings, view, gaussians, &linear, out);
         }
         if settings.space != 0 {
@@ -209,7 +208,7 @@ impl DirectAppearance {
         processor::paint(settings, &self.graph, (&seen, &quality), &mut memory, &mut color);
     }
 
-    /// From the next update on keeps what each view saw, for [`Self::observations`].
+    /// Keeps the observations of each view from the next update on, for [`Self::observations`].
     ///
     /// # Errors
     /// [`GpuError::TooLarge`].
@@ -220,7 +219,7 @@ impl DirectAppearance {
         Ok(())
     }
 
-    /// What the last update, which must have been submitted, found out. `views` is the number of views it was given;
+    /// Reads back the observations of the last update, which must have been submitted. `views` is its number of views;
     /// their lists are empty without [`Self::keep_observations`].
     ///
     /// # Errors
@@ -236,19 +235,6 @@ impl DirectAppearance {
         })
     }
 
-    /// The same where it lies on the GPU.
-    #[must_use]
-    pub fn observation_buffers(&self) -> ObservationBuffers<'_> {
-        ObservationBuffers {
-            views: self.kept.iter().collect(),
-            seen: &self.seen,
-            quality: &self.quality,
-            nodes: self.graph.node_count as usize,
-            node_seen: &self.graph.node_seen,
-            node_color: &self.graph.node_color,
-        }
-    }
-
     /// Reads the colour memory back: accumulated linear RGB of each Gaussian and its weight.
     ///
     /// # Errors
@@ -260,7 +246,7 @@ impl DirectAppearance {
     /// Resumes from the colour memory of an earlier appearance of the same Gaussians.
     ///
     /// # Errors
-    /// [`AppearanceError::GaussianCount`] when it is of another number of Gaussians.
+    /// [`AppearanceError::GaussianCount`] for another number of Gaussians.
     pub fn resume(&mut self, gpu: &GpuContext, memory: &[[f32; 4]]) -> Result<(), AppearanceError> {
         let (expected, found) = (self.seen.len(), memory.len());
         if found != expected {
@@ -301,7 +287,7 @@ impl DirectAppearance {
             let inputs = [
                 ("the image", "pixels", pixels, view.picture.len()),
                 ("the canonical map", "pixels", pixels, view.canonical.len()),
-                ("the drawn image", "pixels", pixels, view.drawn.len()),
+                ("the rendered image", "pixels", pixels, view.rendered.len()),
             ];
             for (what, unit, needed, found) in inputs {
                 if needed != found {

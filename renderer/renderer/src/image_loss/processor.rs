@@ -1,4 +1,4 @@
-//! `image_loss.wgsl` on the processor. Threads share rows; sums are made a row at a time, in the rows' order.
+//! `image_loss.wgsl` on the processor. Threads share rows; sums run per row, in the order of the rows.
 
 use std::array::from_fn;
 
@@ -6,11 +6,13 @@ use flyrig_gpu::StorageBuffer;
 use glam::Vec4;
 use rayon::prelude::*;
 
-use super::{ImageGradients, Loss, SUMS, UNKNOWN_RGBA};
+use crate::backward::gradients::ImageGradients;
+use crate::image_loss::settings::{LossConstants, SUMS, UNKNOWN_RGBA};
 
-/// Converts sRGB bytes with coverage to premultiplied linear colour at the compared size; negative where nothing is known.
+/// Converts sRGB bytes with coverage to premultiplied linear colour at the compared size; negative where the image is
+/// unknown.
 pub(super) fn unpack(
-    loss: &Loss,
+    loss: &LossConstants,
     bytes: &StorageBuffer<u32>,
     linear: &StorageBuffer<f32>,
     wanted: &StorageBuffer<[f32; 4]>,
@@ -40,15 +42,17 @@ pub(super) fn unpack(
     });
 }
 
-/// Compares a drawn image with the wanted one.
+/// Compares a rendered image with the wanted one.
 pub(super) fn compare(
-    loss: &Loss,
+    loss: &LossConstants,
     wanted: &StorageBuffer<[f32; 4]>,
-    drawn: &StorageBuffer<[f32; 4]>,
+    rendered: &StorageBuffer<[f32; 4]>,
     out: &ImageGradients,
     sums: &StorageBuffer<[f32; 4]>,
 ) {
-    let (Some(wanted), Some(drawn), Some(mut sums)) = (wanted.slice(), drawn.slice(), sums.slice_mut()) else { return };
+    let (Some(wanted), Some(rendered), Some(mut sums)) = (wanted.slice(), rendered.slice(), sums.slice_mut()) else {
+        return;
+    };
     let (Some(mut d_color), Some(mut d_carry)) = (out.color.slice_mut(), out.depth_carry.slice_mut()) else { return };
     let width = loss.size[0] as usize;
     let [left, top] = loss.first.map(|side| side as usize);
@@ -67,7 +71,7 @@ pub(super) fn compare(
                     (*d_color, *d_carry) = ([0.0; 4], [0.0; 4]);
                     continue;
                 }
-                let off = Vec4::from(drawn[at]) - goal;
+                let off = Vec4::from(rendered[at]) - goal;
                 let squared = off.truncate().length_squared();
                 sums[0] += loss.color_weight * squared + loss.mask_weight * off.w * off.w;
                 sums[1] += off.w * off.w;
@@ -76,8 +80,9 @@ pub(super) fn compare(
                 *d_color = (along * off).to_array();
                 *d_carry = [0.0; 4];
                 if x > left && y > top && x < right && y < bottom {
-                    let slope =
-                        |after: usize, before: usize| 0.5 * (Vec4::from(drawn[after]) - Vec4::from(drawn[before]));
+                    let slope = |after: usize, before: usize| {
+                        0.5 * (Vec4::from(rendered[after]) - Vec4::from(rendered[before]))
+                    };
                     let (dx, dy) = (slope(at + 1, at - 1), slope(at + width, at - width));
                     *d_carry = [0.0, (along * dx).dot(dx), (along * dx).dot(dy), (along * dy).dot(dy)];
                 }
@@ -93,9 +98,9 @@ pub(super) fn compare(
     }
 }
 
-/// The rows of the area within an image: number of the row, and its part in the area.
+/// Returns the rows of the area within an image: row number, and the part of the row in the area.
 fn rows<'a>(
-    loss: &Loss,
+    loss: &LossConstants,
     picture: &'a mut [[f32; 4]],
 ) -> impl IndexedParallelIterator<Item = (usize, &'a mut [[f32; 4]])> {
     let (first, area) = (loss.first.map(|side| side as usize), loss.area.map(|side| side as usize));

@@ -18,7 +18,7 @@ struct Seen {
     closeness: f64,
 }
 
-/// What goes on from frame to frame.
+/// State that is carried from frame to frame.
 pub struct State {
     /// Colour, weight.
     pub memory: Vec<DVec4>,
@@ -76,7 +76,7 @@ fn observe(
             color += DVec3::new(linear(texel[0]), linear(texel[1]), linear(texel[2])) * belief;
             coverage += belief;
             rendered += DVec4::from_array(view.canonical[index].map(f64::from)) * share;
-            drawn += DVec4::from_array(view.drawn[index].map(f64::from)) * share;
+            drawn += DVec4::from_array(view.rendered[index].map(f64::from)) * share;
         }
         if coverage < 0.01 {
             continue;
@@ -168,9 +168,7 @@ pub fn exact_diffusion(
     views: &[View],
     settings: &AppearanceSettings,
 ) -> Vec<DVec3> {
-    let seen: Vec<Seen> =
-        (0..person.canonical.len()).map(|i| observe(person, frame, views, settings, i, None)).collect();
-    let nodes = gather(person, &seen);
+    let nodes = gather_seen(person, frame, views, settings);
     let mut colors = diffuse(levels, &nodes, f64::from(settings.smoothness));
     for _ in 0..20_000 {
         colors = relax(&levels[0], &nodes, &colors, f64::from(settings.smoothness), 0.9);
@@ -186,10 +184,15 @@ pub fn cascade_diffusion(
     views: &[View],
     settings: &AppearanceSettings,
 ) -> Vec<DVec3> {
+    let colors = diffuse(levels, &gather_seen(person, frame, views, settings), f64::from(settings.smoothness));
+    upsample_all(person, &colors)
+}
+
+/// Gathers what the views see of all Gaussians at the nodes.
+fn gather_seen(person: &Person, frame: &Frame, views: &[View], settings: &AppearanceSettings) -> Vec<DVec4> {
     let seen: Vec<Seen> =
         (0..person.canonical.len()).map(|i| observe(person, frame, views, settings, i, None)).collect();
-    let colors = diffuse(levels, &gather(person, &seen), f64::from(settings.smoothness));
-    upsample_all(person, &colors)
+    gather(person, &seen)
 }
 
 fn upsample_all(person: &Person, nodes: &[DVec3]) -> Vec<DVec3> {

@@ -2,6 +2,8 @@
 //! formulas, so images and canonical maps are made without any rasteriser of ours.
 
 use flyrig_body::{DeformationGraph, Part, SkinWeights, SurfaceGaussians};
+use flyrig_gpu::{GpuContext, GpuError, StorageBuffer};
+use flyrig_renderer::ViewInput;
 use flyrig_types::{Camera, Intrinsics, Isometry, Lens};
 use glam::{DQuat, DVec2, DVec3, Vec2, Vec3};
 
@@ -9,7 +11,7 @@ use glam::{DQuat, DVec2, DVec3, Vec2, Vec3};
 const PARTS: [(DVec3, DVec3); 2] =
     [(DVec3::new(0.0, 1.0, 0.0), DVec3::new(0.25, 0.6, 0.2)), (DVec3::new(0.0, 1.1, 0.45), DVec3::new(0.1, 0.1, 0.1))];
 
-/// What does not change.
+/// Constant part of the scene.
 pub struct Person {
     pub surface: SurfaceGaussians,
     pub graph: DeformationGraph,
@@ -18,7 +20,7 @@ pub struct Person {
     pub body_count: usize,
 }
 
-/// How far the Gaussians lie below the surface that the cameras see, metres.
+/// Depth of the Gaussians below the surface that the cameras see, metres.
 pub const DEPTH_M: f32 = 0.004;
 
 /// The posed Gaussians of an instant.
@@ -29,14 +31,14 @@ pub struct Frame {
     pub normal: Vec<[f32; 4]>,
 }
 
-/// What a camera delivers.
+/// Images of one camera.
 #[derive(Clone)]
 pub struct View {
     pub camera: Camera,
     pub rgba: Vec<u8>,
     pub canonical: Vec<[f32; 4]>,
     /// Colours of the last frame's Gaussians, paler than the image.
-    pub drawn: Vec<[f32; 4]>,
+    pub rendered: Vec<[f32; 4]>,
 }
 
 /// Evenly spread Gaussians and nodes, a ninth of them on the ball.
@@ -173,13 +175,13 @@ pub fn view(frame: &Frame, camera: &Camera, background: [u8; 3], paint: impl Fn(
         };
         PARTS.into_iter().filter_map(along).min_by(f64::total_cmp).map(|t| eye + direction * t)
     };
-    let (mut rgba, mut canonical, mut drawn) = (Vec::new(), Vec::new(), Vec::new());
+    let (mut rgba, mut canonical, mut rendered) = (Vec::new(), Vec::new(), Vec::new());
     for y in 0..height as i64 {
         for x in 0..width as i64 {
             let Some(point) = hit(x, y) else {
                 rgba.extend([background[0], background[1], background[2], 0]);
                 canonical.push([0.0; 4]);
-                drawn.push([0.0; 4]);
+                rendered.push([0.0; 4]);
                 continue;
             };
             let inner = [(1, 0), (-1, 0), (0, 1), (0, -1)].iter().all(|(dx, dy)| hit(x + dx, y + dy).is_some());
@@ -189,12 +191,36 @@ pub fn view(frame: &Frame, camera: &Camera, background: [u8; 3], paint: impl Fn(
             }
             rgba.push(if inner { 255 } else { 128 });
             let alpha = if inner { 1.0 } else { 0.75 };
-            drawn.push(
+            rendered.push(
                 [color[0], color[1], color[2], 255].map(|c| (alpha * (0.5 * f64::from(c) / 255.0 + 0.5 * 0.3)) as f32),
             );
-            drawn[canonical.len()][3] = alpha as f32;
+            rendered[canonical.len()][3] = alpha as f32;
             canonical.push((point * alpha).as_vec3().extend(alpha as f32).to_array());
         }
     }
-    View { camera: camera.clone(), rgba, canonical, drawn }
+    View { camera: camera.clone(), rgba, canonical, rendered }
+}
+
+/// Images of one camera on the device: bytes, canonical positions, last colours.
+pub type ViewBuffers = (StorageBuffer<u32>, StorageBuffer<[f32; 4]>, StorageBuffer<[f32; 4]>);
+
+/// Uploads the images of all cameras.
+pub fn upload(gpu: &GpuContext, views: &[View]) -> Result<Vec<ViewBuffers>, GpuError> {
+    let one = |view: &View| {
+        let map = |map: &[[f32; 4]]| StorageBuffer::from_slice(gpu, "map", map);
+        Ok((StorageBuffer::from_bytes(gpu, "image", &view.rgba)?, map(&view.canonical)?, map(&view.rendered)?))
+    };
+    views.iter().map(one).collect()
+}
+
+/// Joins cameras and uploaded images.
+pub fn inputs<'a>(views: &'a [View], buffers: &'a [ViewBuffers]) -> Vec<ViewInput<'a>> {
+    let input = |(view, (picture, canonical, rendered)): (&'a View, &'a ViewBuffers)| ViewInput {
+        camera: &view.camera,
+        picture,
+        canonical,
+        rendered,
+        gaussians: None,
+    };
+    views.iter().zip(buffers).map(input).collect()
 }

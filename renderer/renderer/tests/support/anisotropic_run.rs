@@ -58,7 +58,7 @@ impl<'a> Kernels<'a> {
         self.add(scene, scene, views, settings)
     }
 
-    /// The same when `other` was drawn in place of the scene.
+    /// Runs as above, with `other` drawn in place of the scene.
     pub fn run_other(
         &mut self,
         scene: &Ellipsoids,

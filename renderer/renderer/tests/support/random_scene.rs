@@ -71,7 +71,7 @@ pub fn random_scene(rng: &mut StdRng, count: usize) -> Scene {
     scene
 }
 
-/// The same scene, camera and near plane with all lengths of the world times `unit`, nothing culled.
+/// Scales scene, camera and near plane by `unit`, with nothing culled.
 pub fn scaled(scene: &Scene, camera: &Camera, unit: f64) -> (Scene, Camera, RasterSettings) {
     let (mut scene, mut camera) = (scene.clone(), camera.clone());
     scene.center_scale.as_flattened_mut().iter_mut().for_each(|v| *v *= unit as f32);

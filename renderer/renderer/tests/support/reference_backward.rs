@@ -40,12 +40,12 @@ fn unclamped_alpha(s: &Splat, x: f64, y: f64) -> f64 {
     s.opacity * (-0.5 * (s.xx * d.x * d.x + 2.0 * s.xy * d.x * d.y + s.yy * d.y * d.y)).exp()
 }
 
-/// Who touches what.
+/// Pixels that each splat touches.
 pub fn touched(scene: &Scene, camera: &Camera, settings: &RasterSettings, size: (u32, u32)) -> Touched {
     touched_by(sorted_splats(scene, camera, settings), size)
 }
 
-/// Who touches what, of splats that are sorted by depth.
+/// Finds the pixels that each splat touches; splats are sorted by depth.
 pub fn touched_by(splats: Vec<Splat>, (width, height): (u32, u32)) -> Touched {
     let pixels = width as usize * height as usize;
     let mut lists: Vec<Vec<usize>> = vec![Vec::new(); pixels];

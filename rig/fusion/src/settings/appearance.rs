@@ -7,7 +7,6 @@ use flyrig_renderer::AppearanceSettings;
 use flyrig_stfa::{EMBEDDED, Parameters};
 use serde::{Deserialize, Serialize};
 
-use super::range::check;
 use crate::error::FusionError;
 
 /// Method that colours the Gaussians.
@@ -48,17 +47,6 @@ impl AppearanceMode {
     }
 }
 
-/// Device of the networks.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize, ValueEnum)]
-#[serde(rename_all = "kebab-case")]
-pub enum NetworksOn {
-    /// All cores of the processor.
-    #[default]
-    Processor,
-    /// The graphics adapter that draws; needs the feature `gpu-networks`.
-    Adapter,
-}
-
 /// Settings of appearance and its networks.
 #[derive(Debug, Clone, PartialEq, Default, Serialize, Deserialize, Args)]
 #[serde(deny_unknown_fields, default)]
@@ -70,13 +58,6 @@ pub struct AppearanceOptions {
     #[arg(long)]
     #[serde(with = "path_or_empty")]
     pub weights: Option<PathBuf>,
-    /// Reuse of the networks' results from frame to frame, 0 to 1: features of images that did not change at all, and the corrections of
-    /// Gaussians none of whose inputs changed by more than this. 0 computes everything anew.
-    #[arg(long, default_value_t = 0.0)]
-    pub reuse: f32,
-    /// Device of the networks; "adapter" needs a flyrig that was built with the feature gpu-networks.
-    #[arg(long, value_enum, default_value = "processor")]
-    pub networks_on: NetworksOn,
 }
 
 impl AppearanceOptions {
@@ -95,20 +76,6 @@ impl AppearanceOptions {
             return Ok(None);
         }
         Ok(Some(Parameters::named(self.weights.as_deref().unwrap_or(Path::new(EMBEDDED[0].0)))?))
-    }
-
-    /// Checks every value.
-    ///
-    /// # Errors
-    /// [`FusionError::Setting`] names the key and the range.
-    pub fn validate(&self) -> Result<(), FusionError> {
-        check("appearance.reuse", f64::from(self.reuse), 0.0, 1.0)?;
-        if self.reuse != 0.0 && self.networks_on == NetworksOn::Adapter {
-            let text = "networks on the adapter keep nothing from frame to frame: set appearance.reuse to 0, or \
-                        appearance.networks_on to \"processor\"";
-            return Err(FusionError::Setting(text.to_owned()));
-        }
-        Ok(())
     }
 }
 

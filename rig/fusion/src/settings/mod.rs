@@ -9,7 +9,7 @@ pub(crate) mod range;
 pub(crate) mod session;
 pub(crate) mod tracking;
 
-pub use appearance::{AppearanceMode, AppearanceOptions, NetworksOn};
+pub use appearance::{AppearanceMode, AppearanceOptions};
 pub use body::BodySettings;
 pub use budget::BudgetSettings;
 pub use effort::Effort;

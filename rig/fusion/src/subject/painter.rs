@@ -68,8 +68,7 @@ impl GaussianPainter {
         };
         let Some(parameters) = settings.appearance.load_networks()? else { return Ok(Self::Direct(Box::new(direct))) };
         direct.appearance.keep_observations(gpu)?;
-        let mut networks = LearnedAppearance::new(&parameters, body.clone());
-        networks.reuse = settings.appearance.reuse;
+        let networks = LearnedAppearance::new(&parameters, body.clone());
         let colors = StorageBuffer::zeroed(gpu, "direct colours", surface.len())?;
         colors.write(gpu, &vec![UNPAINTED; surface.len()]);
         Ok(Self::Learned(Box::new(LearnedPainter { direct, networks, colors })))
@@ -242,7 +241,7 @@ impl DirectPainter {
                 camera: views[i].camera,
                 picture: &images.images()[i].words,
                 canonical: &self.visibility[i].canonical,
-                drawn: &self.visibility[i].color,
+                rendered: &self.visibility[i].color,
                 gaussians: (instants.of_view(i) > 0).then(|| geometry.at(instants.of_view(i))),
             })
             .collect();
@@ -302,8 +301,6 @@ impl LearnedPainter {
         geometry.gaussians().color.write(gpu, &colors);
         stages.add("networks", start.elapsed());
         let counts = self.networks.counts;
-        stages.count("views not encoded", counts.views_kept - before.views_kept);
-        stages.count("Gaussian corrections used again", counts.colors_kept - before.colors_kept);
         stages.count("corrections that were no numbers", counts.poisoned - before.poisoned);
         Ok(())
     }

@@ -1,0 +1,5 @@
+//! Edits of a finished avatar: its texture and its shape.
+
+pub(crate) mod atlas;
+pub(crate) mod paint;
+mod reshape;

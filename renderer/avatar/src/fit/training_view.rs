@@ -1,0 +1,72 @@
+//! Images of a take, cropped to the person.
+
+use flyrig_types::Camera;
+
+use crate::fit::image_error::Photograph;
+use crate::fit::outline::mixed;
+
+/// Margin around the person, pixels.
+const MARGIN_PX: u32 = 12;
+/// Divisor of the sides of crops, pixels: buffers are allocated for each size, so few sizes are wanted.
+const SIDE_PX: u32 = 64;
+
+/// Image cropped to the person.
+#[derive(Debug, Clone)]
+pub struct TrainingView {
+    pub(crate) frame: usize,
+    pub(crate) camera: Camera,
+    /// sRGB and mask.
+    rgba: Vec<u8>,
+    /// Pixels whose colour is mixed with the background.
+    mixed: Vec<bool>,
+}
+
+impl TrainingView {
+    /// Crops an image, sRGB with the mask as alpha, to the person. `None` without a person, or for bytes that do not
+    /// match the camera's size.
+    #[must_use]
+    pub fn cut(frame: usize, camera: &Camera, rgba: &[u8]) -> Option<Self> {
+        let (width, height) = (camera.intrinsics.width, camera.intrinsics.height);
+        if width == 0 || rgba.len() != width as usize * height as usize * 4 {
+            return None;
+        }
+        let (mut least, mut most) = ([u32::MAX; 2], [0; 2]);
+        for (y, row) in (0u32..).zip(rgba.chunks_exact(4 * width as usize)) {
+            for (x, _) in (0u32..).zip(row.chunks_exact(4)).filter(|(_, pixel)| pixel[3] > 127) {
+                least = [least[0].min(x), least[1].min(y)];
+                most = [most[0].max(x), most[1].max(y)];
+            }
+        }
+        if least[0] > most[0] {
+            return None;
+        }
+        // A cut as large as its class of size, moved into the image.
+        let range = |k: usize, whole: u32| {
+            let wanted = most[k] - least[k] + 1 + 2 * MARGIN_PX;
+            let side = wanted.next_multiple_of(SIDE_PX).min(whole);
+            let first = (least[k] + most[k] + 1).saturating_sub(side) / 2;
+            (first.min(whole - side), side)
+        };
+        let ((left, columns), (top, rows)) = (range(0, width), range(1, height));
+        let mut cut = Vec::with_capacity(columns as usize * rows as usize * 4);
+        for y in top..top + rows {
+            let first = (y as usize * width as usize + left as usize) * 4;
+            cut.extend(&rgba[first..first + 4 * columns as usize]);
+        }
+        let mixed = mixed(&cut, columns as usize);
+        let mut camera = camera.clone();
+        camera.intrinsics.center_px -= glam::DVec2::new(f64::from(left), f64::from(top));
+        (camera.intrinsics.width, camera.intrinsics.height) = (columns, rows);
+        Some(Self { frame, camera, rgba: cut, mixed })
+    }
+
+    /// Returns width and height, pixels.
+    pub(crate) fn size(&self) -> [u32; 2] {
+        [self.camera.intrinsics.width, self.camera.intrinsics.height]
+    }
+
+    /// Returns the pixels to compare with.
+    pub(crate) fn photograph(&self) -> Photograph<'_> {
+        Photograph { rgba: &self.rgba, mixed: &self.mixed }
+    }
+}

@@ -1,0 +1,86 @@
+//! Learned attributes of an avatar's Gaussians, in canonical space.
+
+use flyrig_renderer::HarmonicOrder;
+use rayon::prelude::*;
+
+/// Element of every list: four numbers.
+pub(crate) type Element = [f32; 4];
+
+/// Learned attributes: one row per Gaussian, and one row of harmonics per coefficient. Derivatives have the same form.
+#[derive(Debug, Clone, PartialEq)]
+pub struct GaussianParameters {
+    /// Offset from the Gaussian's position on the surface, canonical metres; w unused.
+    pub offset: Vec<Element>,
+    /// Logarithms of the standard deviations along the Gaussian's own axes in metres; w: logit of the opacity.
+    pub shape: Vec<Element>,
+    /// Quaternion x, y, z, w: canonical from the Gaussian's axes.
+    pub rotation: Vec<Element>,
+    /// Coefficients of linear RGB in world directions; w unused.
+    pub harmonics: Vec<Element>,
+    order: HarmonicOrder,
+}
+
+impl GaussianParameters {
+    /// Creates zero attributes with identity rotations.
+    #[must_use]
+    pub fn zeroed(count: usize, order: HarmonicOrder) -> Self {
+        Self {
+            offset: vec![[0.0; 4]; count],
+            shape: vec![[0.0; 4]; count],
+            rotation: vec![[0.0, 0.0, 0.0, 1.0]; count],
+            harmonics: vec![[0.0; 4]; count * order.coefficients()],
+            order,
+        }
+    }
+
+    /// Assembles lists; `None` where their lengths do not match.
+    #[must_use]
+    pub fn from_lists([offset, shape, rotation, harmonics]: [Vec<Element>; 4]) -> Option<Self> {
+        let count = offset.len();
+        let order = HarmonicOrder::ALL.into_iter().find(|order| harmonics.len() == count * order.coefficients())?;
+        (shape.len() == count && rotation.len() == count).then_some(Self { offset, shape, rotation, harmonics, order })
+    }
+
+    /// Returns the number of Gaussians.
+    #[must_use]
+    pub fn len(&self) -> usize {
+        self.offset.len()
+    }
+
+    /// Returns whether there are no Gaussians.
+    #[must_use]
+    pub fn is_empty(&self) -> bool {
+        self.offset.is_empty()
+    }
+
+    /// Returns the harmonic order of the colours.
+    #[must_use]
+    pub fn order(&self) -> HarmonicOrder {
+        self.order
+    }
+
+    /// Returns the lists: offset, shape, rotation, harmonics.
+    #[must_use]
+    pub fn lists(&self) -> [&[Element]; 4] {
+        [&self.offset, &self.shape, &self.rotation, &self.harmonics]
+    }
+
+    pub(crate) fn lists_mut(&mut self) -> [&mut [Element]; 4] {
+        [&mut self.offset, &mut self.shape, &mut self.rotation, &mut self.harmonics]
+    }
+
+    /// Appends a Gaussian of one colour: coefficients of order zero, linear RGB.
+    pub(crate) fn push(&mut self, shape: Element, rotation: Element, constant: Element) {
+        self.offset.push([0.0; 4]);
+        self.shape.push(shape);
+        self.rotation.push(rotation);
+        self.harmonics.push(constant);
+        self.harmonics.resize(self.len() * self.order.coefficients(), [0.0; 4]);
+    }
+
+    /// Returns whether every number is finite.
+    #[must_use]
+    pub fn is_finite(&self) -> bool {
+        self.lists().iter().all(|list| list.par_iter().all(|row| row.iter().all(|value| value.is_finite())))
+    }
+}

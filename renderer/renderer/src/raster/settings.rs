@@ -1,0 +1,98 @@
+//! Settings of a rendering and statistics of the latest one.
+
+use crate::anisotropic::buffers::Gaussians;
+use crate::anisotropic::order::HarmonicOrder;
+
+/// Selection of the images of a [`crate::RenderTarget`] that are written; the others keep their content.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
+pub struct Outputs {
+    /// Whether [`crate::RenderTarget::color`] is written.
+    pub color: bool,
+    /// Whether [`crate::RenderTarget::depth`] is written.
+    pub depth: bool,
+    /// Whether [`crate::RenderTarget::canonical`] is written.
+    pub canonical: bool,
+}
+
+impl Outputs {
+    /// All images.
+    pub const ALL: Self = Self { color: true, depth: true, canonical: true };
+    /// Colour and alpha only.
+    pub const COLOR: Self = Self { color: true, depth: false, canonical: false };
+    /// Colour, alpha and canonical positions: the inputs of direct appearance.
+    pub const SURFACE: Self = Self { color: true, depth: false, canonical: true };
+}
+
+/// Settings of a rendering.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct RasterSettings {
+    /// Distance from the camera's plane below which centres are skipped, metres.
+    pub near_m: f32,
+    /// Whether Gaussians whose normal points away from the camera are skipped ([`crate::BACKFACING_COSINE`]). For
+    /// closed surfaces.
+    pub cull_backfacing: bool,
+    /// Images to write.
+    pub outputs: Outputs,
+    /// Variance of the low-pass filter that is added to every splat on the screen, square pixels. The splat's opacity
+    /// decreases so that its integral is preserved: Mip-Splatting's 2D Mip filter (Yu et al. 2024, Eq. 10). 0.1 is that
+    /// paper's value for one pixel.
+    pub filter_variance_px2: f32,
+    /// Part of the image whose tiles are blended, `[left, top, right, bottom]` in pixels, right and bottom excluded;
+    /// all other tiles keep their content. `None`: the whole image.
+    pub area: Option<[u32; 4]>,
+}
+
+impl Default for RasterSettings {
+    fn default() -> Self {
+        Self { near_m: 0.05, cull_backfacing: true, outputs: Outputs::ALL, filter_variance_px2: 0.1, area: None }
+    }
+}
+
+impl RasterSettings {
+    /// Returns the settings that apply to this kind of Gaussians.
+    pub(crate) fn for_kind(&self, gaussians: Gaussians<'_>) -> Self {
+        match gaussians {
+            Gaussians::Isotropic(_) => *self,
+            Gaussians::Anisotropic(_) => {
+                let outputs = Outputs { canonical: false, ..self.outputs };
+                Self { cull_backfacing: false, outputs, ..*self }
+            }
+        }
+    }
+}
+
+/// Resources used by the latest image.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub struct RasterStats {
+    /// Gaussians that touch the image.
+    pub visible_gaussians: u32,
+    /// Pairs of a Gaussian and a tile, at most one more than the capacity.
+    pub pairs: u32,
+    /// Images so far that exceeded the capacity for pairs and lack their farthest Gaussians.
+    pub overflowed_images: u32,
+}
+
+/// Description of the image that was recorded last, for the backward pass.
+#[derive(Debug, Clone, Copy)]
+pub(crate) struct Latest {
+    pub gaussians: usize,
+    /// Harmonic order of the colours; `None` for isotropic Gaussians.
+    pub order: Option<HarmonicOrder>,
+    pub size: [u32; 2],
+    /// Columns and rows of tiles that were blended.
+    pub blended: [u32; 2],
+    pub outputs: Outputs,
+}
+
+/// Returns the first tile, and columns and rows of the tiles that an area of pixels touches.
+pub(crate) fn tile_range(area: Option<[u32; 4]>, tiles: [u32; 2], tile: u32) -> ([u32; 2], [u32; 2]) {
+    let Some([left, top, right, bottom]) = area else { return ([0; 2], tiles) };
+    let range = |first: u32, end: u32, count: u32| {
+        let tiles = if first < end { end.div_ceil(tile).min(count) } else { 0 };
+        let first = (first / tile).min(count);
+        (first, tiles.saturating_sub(first))
+    };
+    let (x, columns) = range(left, right, tiles[0]);
+    let (y, rows) = range(top, bottom, tiles[1]);
+    ([x, y], [columns, rows])
+}
