@@ -58,8 +58,8 @@ pub use perception::{
 pub use publish::{LivePublisher, LiveViews, OutputSettings, PersonEncoder, PersonMessages, orbit};
 pub use session::{Budget, Counts, Outcome, Session, SessionBuilder};
 pub use settings::{
-    AppearanceMode, AppearanceOptions, BodySettings, BudgetSettings, Effort, Origin, PerceptionSettings, SessionSettings,
-    Solver, TrackingSettings,
+    AppearanceMode, AppearanceOptions, BodySettings, BudgetSettings, Effort, Origin, PerceptionSettings,
+    SessionSettings, Solver, TrackingSettings,
 };
 pub use subject::{
     Observed, PROCESSOR_STAGE, PersonFrame, PersonMemory, Remedy, Subject, TrackState, TrackWatch, person_gaussians,
