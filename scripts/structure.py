@@ -94,7 +94,7 @@ def fences():
 
 
 def cycles():
-    """Strongly connected groups of files of one crate that import each other (parent modules aside)."""
+    """Strongly connected groups of files of one crate that import each other; crate roots and re-exports left out."""
     groups = []
     for crate in sorted({f.rsplit("/src/", 1)[0] for f in rust if "/src/" in f}):
         files = {}
@@ -102,10 +102,11 @@ def cycles():
             if path.startswith(f"{crate}/src/") and not is_test(path):
                 module = path[len(crate) + 5 : -3]
                 module = module[:-4] if module.endswith("/mod") else module
-                files["" if module in ("lib", "main") else module] = path
+                if module not in ("lib", "main"):
+                    files[module] = path
         edges = {module: set() for module in files}
         for module, path in files.items():
-            code = blank(production(path))
+            code = re.sub(r"\bpub(?:\([^)]*\))? use [^;]*;", "", blank(production(path)))
             parent = module.rsplit("/", 1)[0] if "/" in module else ""
             for use in re.findall(r"\b(?:use\s+)?((?:crate|super|self)(?:::(?:\w+|\{[^;]*?\}))+)", code):
                 for target in expand(use):
@@ -128,6 +129,10 @@ def cycles():
                             break
                     if known is not None and known != module:
                         edges[module].add(known)
+            inside = f"{module}/" if module else ""
+            for name in re.findall(r"(?<![:\w])(\w+)::", code):
+                if inside + name in files:
+                    edges[module].add(inside + name)
         for group in components(edges):
             if len(group) > 1:
                 groups.append(" ".join(sorted(files[m] for m in group)))

@@ -6,13 +6,30 @@ use flyrig_types::{Camera, Intrinsics, Isometry, Lens, Mask, Pose, Rig};
 use glam::{DQuat, DVec2, DVec3};
 use rand::{RngExt, SeedableRng, rngs::StdRng};
 
-use crate::body_model::{BodyModel, Turns};
-use crate::fit::{FitProblem, FitView};
-use crate::gate::drawn_body;
-use crate::{Keypoint, LANDMARK_COUNT, ViewKeypoints};
+use crate::landmarks::keypoints::{Keypoint, LANDMARK_COUNT, ViewKeypoints};
+use crate::masks::gate::drawn_body;
+use crate::pose::body_model::{BodyModel, Turns};
+use crate::pose::fit::{FitProblem, FitView};
 
 pub(crate) fn body() -> Template {
     default_template(&ShapeParams::default()).unwrap()
+}
+
+/// A pinhole camera of small square images at the world's origin, about 56 degrees wide.
+pub(crate) fn small_camera(id: &str, side: usize) -> Camera {
+    Camera {
+        time_offset_nanos: 0,
+        color: Default::default(),
+        id: id.into(),
+        intrinsics: Intrinsics {
+            width: side as u32,
+            height: side as u32,
+            focal_px: DVec2::splat(90.0),
+            center_px: DVec2::splat(0.5 * side as f64 - 0.5),
+            lens: Lens::PINHOLE,
+        },
+        camera_from_world: Isometry::IDENTITY,
+    }
 }
 
 /// Cameras on a ring of 3.5 m around the origin, z up, with some distortion.

@@ -4,7 +4,7 @@ use flyrig_body::{SkinWeights, skin_jacobian_f64};
 use glam::{DMat3, DVec3};
 use rayon::prelude::*;
 
-use super::PointDerivatives;
+use crate::deform::data::PointDerivatives;
 
 /// Of one Gaussian.
 #[derive(Debug, Clone, Copy)]

@@ -14,13 +14,9 @@
 //! Everything is `f64` and summed in a fixed order.
 
 mod carry;
-mod data;
+pub(crate) mod data;
 mod normal;
 mod regularizer;
-mod settings;
+pub(crate) mod settings;
 mod thickness;
-mod track;
-
-pub use data::{DataTerm, PointDerivatives};
-pub use settings::{DeformSettings, DeformSolver, FIRST_FRAMES};
-pub use track::{DeformReport, DeformTracker};
+pub(crate) mod track;

@@ -3,7 +3,7 @@
 use glam::{DMat3, DVec3};
 use rayon::prelude::*;
 
-use super::carry::Carried;
+use crate::deform::carry::Carried;
 
 /// Entry of a list of pairs that stands for none.
 const NONE: u32 = u32::MAX;

@@ -2,7 +2,7 @@
 
 use glam::DVec3;
 
-use super::thickness::Thickness;
+use crate::deform::thickness::Thickness;
 
 /// Eq. 4 over the directed edges of the graph, times λ_reg.
 #[derive(Debug)]

@@ -2,7 +2,7 @@
 
 use glam::DVec3;
 
-use super::normal::NormalMatrix;
+use crate::deform::normal::NormalMatrix;
 
 /// A part that is seen less than this share of what all parts are together is believed to be like the others.
 const LEAST_SHARE: f64 = 0.01;

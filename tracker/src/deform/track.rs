@@ -4,13 +4,13 @@ use flyrig_body::{DeformationGraph, SkinWeights, displacement};
 use glam::{DVec3, Vec3};
 use rayon::prelude::*;
 
-use super::carry::to_canonical;
-use super::normal::NormalMatrix;
-use super::regularizer::Regularizer;
-use super::settings::FIRST_FRAMES;
-use super::thickness::Thickness;
-use super::{DataTerm, DeformSettings, DeformSolver, PointDerivatives};
-use crate::{TrackError, TrackErrorKind};
+use crate::deform::carry::to_canonical;
+use crate::deform::data::{DataTerm, PointDerivatives};
+use crate::deform::normal::NormalMatrix;
+use crate::deform::regularizer::Regularizer;
+use crate::deform::settings::{DeformSettings, DeformSolver, FIRST_FRAMES};
+use crate::deform::thickness::Thickness;
+use crate::error::{TrackError, TrackErrorKind};
 
 /// Damping never falls below or rises above these shares of the mean diagonal.
 const DAMPING_RANGE: (f64, f64) = (1e-3, 1e6);

@@ -4,10 +4,10 @@ use flyrig_solve::RigidMotion;
 use flyrig_types::Camera;
 use glam::{DVec2, DVec3};
 
-use super::HAND_LANDMARKS;
-use crate::body_model::{BodyModel, Posed};
-use crate::crop::Crop;
-use crate::view::View;
+use crate::hands::hand_net::HAND_LANDMARKS;
+use crate::image::crop::Crop;
+use crate::image::view::View;
+use crate::pose::body_model::{BodyModel, Posed};
 
 /// A look says nothing any more after this long, seconds.
 pub(crate) const FORGET_SECS: f64 = 0.4;

@@ -2,8 +2,8 @@
 
 use glam::DVec2;
 
-use crate::TrackError;
-use crate::landmark_net::{LandmarkNet, sigmoid};
+use crate::error::TrackError;
+use crate::network::landmark_net::{LandmarkNet, sigmoid};
 
 /// Side of the network's crop, pixels.
 pub const FACE_SIDE: usize = 192;
@@ -69,7 +69,7 @@ impl FaceNet {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::TrackErrorKind;
+    use crate::error::TrackErrorKind;
 
     #[test]
     fn the_embedded_network_sees_no_face_in_grey_and_refuses_a_wrong_size() {

@@ -4,14 +4,14 @@ use flyrig_body::Template;
 use flyrig_types::{Camera, Image, Pose};
 use glam::{DMat3, DVec3};
 
-use super::face_points::RIGID;
-use super::looks::FaceTarget;
-use super::{FaceNet, FaceOutput};
-use crate::TrackError;
-use crate::body_model::BodyModel;
-use crate::habits::template_scale;
-use crate::pixels::Rgb;
-use crate::view::View;
+use crate::error::TrackError;
+use crate::hands::crop_schedule::FaceTarget;
+use crate::hands::face_net::{FaceNet, FaceOutput};
+use crate::hands::face_points::RIGID;
+use crate::image::pixels::Rgb;
+use crate::image::view::View;
+use crate::landmarks::bias::template_scale;
+use crate::pose::body_model::BodyModel;
 
 /// Rounds of reweighting, and the distance that loses half its weight, metres.
 const ROUNDS: usize = 15;
@@ -52,7 +52,7 @@ impl FaceStudy {
         template: &Template,
         pose: &Pose,
     ) -> Result<bool, TrackError> {
-        let model = BodyModel::without_habits(template)?;
+        let model = BodyModel::with_anatomical_marks(template)?;
         let Some(turns) = model.to_turns(pose) else { return Ok(false) };
         let posed = model.pose(&turns);
         let scale = template_scale(template);

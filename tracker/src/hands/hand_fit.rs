@@ -12,9 +12,9 @@ use flyrig_solve::{
 use glam::{DQuat, DVec2, DVec3};
 use nalgebra::DVector;
 
-use super::HAND_LANDMARKS;
-use super::hand_model::{Bends, BentHand, HandModel, moving, range, relaxed};
-use crate::view::View;
+use crate::hands::hand_model::{Bends, BentHand, HandModel, moving, range, relaxed};
+use crate::hands::hand_net::HAND_LANDMARKS;
+use crate::image::view::View;
 
 /// Unknowns: shift, turn, four angles of five fingers.
 const SIZE: usize = 26;

@@ -3,9 +3,9 @@
 use flyrig_body::{FingerAxes, Template, finger_axes};
 use glam::{DQuat, DVec3};
 
-use super::HAND_LANDMARKS;
-use crate::anatomy::Roles;
-use crate::{TrackError, TrackErrorKind};
+use crate::error::{TrackError, TrackErrorKind};
+use crate::hands::hand_net::HAND_LANDMARKS;
+use crate::pose::anatomy::Roles;
 
 /// Angles of a finger, radians: flexion and spread of its first joint, flexion of the second and of the third.
 pub(crate) type Bend = [f64; 4];

@@ -2,8 +2,8 @@
 
 use glam::DVec2;
 
-use crate::TrackError;
-use crate::landmark_net::LandmarkNet;
+use crate::error::TrackError;
+use crate::network::landmark_net::LandmarkNet;
 
 /// Side of the network's crop, pixels.
 pub const HAND_SIDE: usize = 224;
@@ -70,7 +70,7 @@ impl HandNet {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::TrackErrorKind;
+    use crate::error::TrackErrorKind;
 
     #[test]
     fn the_embedded_network_sees_no_hand_in_grey_and_refuses_a_wrong_size() {

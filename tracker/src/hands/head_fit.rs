@@ -9,7 +9,7 @@ use flyrig_solve::{
 use glam::{DQuat, DVec2, DVec3};
 use nalgebra::DVector;
 
-use crate::view::View;
+use crate::image::view::View;
 
 /// Unknowns: shift, turn, logarithm of the size.
 const SIZE: usize = 7;

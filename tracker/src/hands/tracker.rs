@@ -8,21 +8,21 @@ use flyrig_types::{Camera, FrameSet, Pose, Rig};
 use glam::{DQuat, DVec3};
 use rayon::prelude::*;
 
-use super::face_points::FACE_POINTS;
-use super::hand_fit::{HandPose, HandProblem, HandSight};
-use super::hand_model::{Bends, HandModel, relaxed};
-use super::head_fit::{FaceSight, HeadProblem};
-use super::looks::{FORGET_SECS, FaceTarget, PartLook, hand_crop};
-use super::{
-    FACE_SIDE, FaceNet, HAND_LANDMARKS, HAND_SIDE, HandNet, HandQuality, HandState, HandsQuality, HeadQuality,
-};
-use crate::body_model::{BodyModel, Posed};
-use crate::crop::Crop;
-use crate::estimator::check_size;
-use crate::habits::template_scale;
-use crate::pixels::Rgb;
-use crate::view::View;
-use crate::{TrackError, TrackErrorKind};
+use crate::error::{TrackError, TrackErrorKind};
+use crate::hands::crop_schedule::{FORGET_SECS, FaceTarget, PartLook, hand_crop};
+use crate::hands::face_net::{FACE_SIDE, FaceNet};
+use crate::hands::face_points::FACE_POINTS;
+use crate::hands::hand_fit::{HandPose, HandProblem, HandSight};
+use crate::hands::hand_model::{Bends, HandModel, relaxed};
+use crate::hands::hand_net::{HAND_LANDMARKS, HAND_SIDE, HandNet};
+use crate::hands::head_fit::{FaceSight, HeadProblem};
+use crate::hands::quality::{HandQuality, HandState, HandsQuality, HeadQuality};
+use crate::image::crop::Crop;
+use crate::image::pixels::Rgb;
+use crate::image::view::View;
+use crate::landmarks::bias::template_scale;
+use crate::pose::body_model::{BodyModel, Posed};
+use crate::pose::estimator::check_size;
 
 /// Presence from which a network's landmarks are believed.
 const MIN_PRESENCE: f64 = 0.5;

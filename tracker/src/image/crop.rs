@@ -1,19 +1,20 @@
-//! Turned square crops for the network.
+//! Rotated square crops of an image, the input of landmark networks.
 
 use glam::DVec2;
 
-use crate::landmarks::{LEFT_HIP, LEFT_SHOULDER, RIGHT_HIP, RIGHT_SHOULDER};
-use crate::net::{NET_SIDE, NetOutput};
-use crate::pixels::Rgb;
-use crate::{Keypoint, LANDMARK_COUNT, ViewKeypoints};
+use crate::image::pixels::Rgb;
+use crate::landmarks::keypoints::{
+    Keypoint, LANDMARK_COUNT, LEFT_HIP, LEFT_SHOULDER, RIGHT_HIP, RIGHT_SHOULDER, ViewKeypoints,
+};
+use crate::network::output::{NET_SIDE, NetOutput};
 
-/// Room around the farthest landmark; the network was trained with a quarter more than the person.
+/// Half side of a crop over the distance of the farthest landmark: the network was trained with a quarter more than the person.
 const MARGIN: f64 = 1.25;
 
-/// A square of an image, turned so that the person stands upright in it.
+/// Square of an image, rotated so that the person stands upright in it.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub(crate) struct Crop {
-    /// Middle, pixels of the image.
+    /// Centre, pixels of the image.
     pub center: DVec2,
     /// Side, pixels of the image.
     pub side: f64,
@@ -22,12 +23,12 @@ pub(crate) struct Crop {
 }
 
 impl Crop {
-    /// An upright square.
+    /// Returns an upright square.
     pub fn upright(center: DVec2, side: f64) -> Self {
         Self { center, side, turn: DVec2::X }
     }
 
-    /// The crop for a person's landmarks: centred on the hips, turned hips-to-shoulders up, reaching a
+    /// Returns the crop for a person's landmarks in image pixels: centred on the hips, shoulders above the hips, reaching a
     /// quarter farther than the farthest landmark. `None` when the points do not span a person.
     pub fn around(points: &[Option<DVec2>; LANDMARK_COUNT]) -> Option<Self> {
         let middle = |a: usize, b: usize| Some((points[a]? + points[b]?) * 0.5);
@@ -43,35 +44,35 @@ impl Crop {
         Some(Self { center: hips, side: 2.0 * MARGIN * reach, turn })
     }
 
-    /// Pixels of the image that one pixel of the network's crop takes.
+    /// Returns the size of a pixel of a crop of [`NET_SIDE`], pixels of the image.
     pub fn scale(&self) -> f64 {
         self.side / NET_SIDE as f64
     }
 
-    /// Image pixel of a crop pixel (pixel centres at integers in both).
+    /// Returns the image pixel of a pixel of a crop of [`NET_SIDE`] (pixel centres at integers in both).
     pub fn to_image(self, crop_px: DVec2) -> DVec2 {
         self.to_image_from(crop_px, NET_SIDE)
     }
 
-    /// The same for a network whose crop has another side, pixels.
+    /// Returns the image pixel of a pixel of a crop of `net_side` pixels (pixel centres at integers in both).
     pub fn to_image_from(self, crop_px: DVec2, net_side: usize) -> DVec2 {
         let offset = (crop_px + 0.5 - 0.5 * net_side as f64) * (self.side / net_side as f64);
         self.center + self.turn.rotate(offset)
     }
 
-    /// Crop pixel of an image pixel.
+    /// Returns the pixel of a crop of [`NET_SIDE`] that an image pixel falls on.
     pub fn crop_from_image(self, image_px: DVec2) -> DVec2 {
         let offset = (self.turn * DVec2::new(1.0, -1.0)).rotate(image_px - self.center);
         offset / self.scale() + 0.5 * NET_SIDE as f64 - 0.5
     }
 
-    /// The network's input: RGB in 0..=1, black outside the image. Each value averages enough samples
-    /// that a large crop does not alias.
+    /// Samples a crop of [`NET_SIDE`]; see [`Self::sample_square`].
     pub fn sample(&self, picture: &Rgb) -> Vec<f32> {
         self.sample_square(picture, NET_SIDE)
     }
 
-    /// The same for a network whose crop has another side, pixels.
+    /// Samples a crop of `net_side` x `net_side` pixels: RGB in 0..=1, row by row, black outside the image. Each value averages
+    /// enough samples that a large crop does not alias.
     pub fn sample_square(&self, picture: &Rgb, net_side: usize) -> Vec<f32> {
         let taps = ((self.side / net_side as f64).round() as usize).clamp(1, 4);
         let mut rgb = Vec::with_capacity(net_side * net_side * 3);
@@ -98,7 +99,7 @@ impl Crop {
         rgb
     }
 
-    /// The network's landmarks in the image.
+    /// Returns the network's landmarks in pixels of the image.
     pub fn keypoints(&self, output: &NetOutput) -> ViewKeypoints {
         std::array::from_fn(|i| {
             let landmark = output.landmarks[i];
@@ -107,7 +108,7 @@ impl Crop {
     }
 }
 
-/// Upright squares of several sizes that cover an image, the whole image first.
+/// Returns upright squares of three sizes that cover an image, the whole image first.
 pub(crate) fn search_crops(width: u32, height: u32) -> Vec<Crop> {
     let (width, height) = (f64::from(width), f64::from(height));
     let long = width.max(height);

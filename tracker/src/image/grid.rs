@@ -1,4 +1,4 @@
-//! One-channel float images and what masks need of them.
+//! One-channel float images: drawing of meshes, distances, box and guided filters (He et al. 2010), connected components.
 
 use std::ops::Range;
 
@@ -6,10 +6,10 @@ use flyrig_types::Mask;
 use glam::DVec2;
 use rayon::prelude::*;
 
-/// Rows that one task takes.
+/// Rows per parallel task.
 const ROWS_A_TASK: usize = 32;
 
-/// A small image of numbers, row by row.
+/// Image of one number per pixel, row by row.
 #[derive(Debug, Clone, PartialEq)]
 pub(crate) struct Grid {
     pub width: usize,
@@ -18,17 +18,18 @@ pub(crate) struct Grid {
 }
 
 impl Grid {
+    /// Returns a grid filled with `value`.
     pub fn new(width: usize, height: usize, value: f32) -> Self {
         Self { width, height, values: vec![value; width * height] }
     }
 
-    /// The rows with their numbers, for all cores; several rows follow each other on one.
+    /// Iterates over rows and their indices in parallel, in tasks of several rows.
     pub fn rows_mut(&mut self) -> impl IndexedParallelIterator<Item = (usize, &mut [f32])> {
         self.values.par_chunks_mut(self.width.max(1)).enumerate().with_min_len(ROWS_A_TASK)
     }
 
-    /// Sets the pixels whose centre lies in one of the triangles, and the pixels of their corners, to 1. Triangles with a vertex that
-    /// has no place are left out.
+    /// Sets the pixels whose centre lies in one of the triangles, and the pixels of their corners, to 1. Triangles with an
+    /// unplaced vertex are ignored. Places are pixels, centres at integers.
     pub fn fill_mesh(&mut self, places: &[Option<DVec2>], triangles: &[[u32; 3]]) {
         let place = |vertex: u32| places.get(vertex as usize).copied().flatten();
         let placed = triangles.iter().filter_map(|&[a, b, c]| Some([place(a)?, place(b)?, place(c)?]));
@@ -45,11 +46,11 @@ impl Grid {
         });
     }
 
-    /// Chamfer distance in pixels (3-4 weights over 3) to the nearest pixel above one half.
+    /// Returns the chamfer distance of each pixel (weights 3 and 4, over 3) to the nearest one above one half, pixels.
     pub fn distance_to_set(&self) -> Self {
         const SIDE: f32 = 1.0;
         const DIAGONAL: f32 = 4.0 / 3.0;
-        // Of a row to the one before it: no pixel waits for its neighbour, so that many are compared at once.
+        // From the row before: no pixel depends on its neighbour, so that this is vectorised.
         let across = |row: &mut [f32], before: &[f32]| {
             row.iter_mut().zip(before).for_each(|(d, before)| *d = d.min(before + SIDE));
             row.iter_mut().skip(1).zip(before).for_each(|(d, before)| *d = d.min(before + DIAGONAL));
@@ -78,7 +79,7 @@ impl Grid {
         out
     }
 
-    /// Mean over a square of `2 radius + 1` pixels, smaller at the border.
+    /// Returns the mean over a square of `2 radius + 1` pixels around each pixel, cut off at the border.
     pub fn box_mean(&self, radius: usize) -> Self {
         if self.values.is_empty() {
             return self.clone();
@@ -88,7 +89,7 @@ impl Grid {
         for (from, to) in self.values.chunks_exact(width).zip(across.values.chunks_exact_mut(width)) {
             running_mean(from, to, radius);
         }
-        // All columns at once, a row after the other.
+        // All columns at once, row by row.
         let mut out = across.clone();
         let mut sums = vec![0.0f64; width];
         let row = |y: usize| &across.values[y * width..(y + 1) * width];
@@ -108,7 +109,8 @@ impl Grid {
         out
     }
 
-    /// Guided filter: smooths along the guide's edges.
+    /// Smooths along the edges of `guide` by the guided filter (He et al. 2010) with a window of `2 radius + 1` pixels and the
+    /// regularisation `epsilon`.
     pub fn guided(&self, guide: &Self, radius: usize, epsilon: f32) -> Self {
         let product =
             |a: &Self, b: &Self| Self { values: a.values.iter().zip(&b.values).map(|(a, b)| a * b).collect(), ..*a };
@@ -127,7 +129,7 @@ impl Grid {
         Self { values: values.collect(), ..*self }
     }
 
-    /// As a mask of a larger image; `None` when no pixel reaches one half.
+    /// Returns the values as a mask of a larger image, placed at (`x0`, `y0`); `None` when no pixel reaches one half.
     pub fn paste(&self, width: usize, height: usize, x0: usize, y0: usize) -> Option<Mask> {
         if !self.values.iter().any(|v| *v >= 0.5) {
             return None;
@@ -143,7 +145,7 @@ impl Grid {
     }
 }
 
-/// Some rows of a grid.
+/// Consecutive rows of a grid.
 struct Band<'a> {
     width: usize,
     rows: Range<usize>,
@@ -156,7 +158,7 @@ impl Band<'_> {
         let low = a.min(b).min(c);
         let high = a.max(b).max(c);
         let rows = self.rows.clone();
-        // Also leaves out what is no number.
+        // Ignores triangles that are not finite, too.
         if !(high.y >= rows.start as f64 && low.y < rows.end as f64 + 1.0) {
             return;
         }
@@ -183,6 +185,7 @@ impl Band<'_> {
     }
 }
 
+/// Writes the mean over `2 radius + 1` values around each value, cut off at the ends.
 fn running_mean(from: &[f32], to: &mut [f32], radius: usize) {
     let mut sum: f64 = from.iter().take(radius).map(|v| f64::from(*v)).sum();
     let whole = 1.0 / (2 * radius + 1) as f64;
@@ -199,7 +202,7 @@ fn running_mean(from: &[f32], to: &mut [f32], radius: usize) {
     }
 }
 
-/// Labels connected pixels (4 neighbours) that `keep`; calls `each` with every component's pixels.
+/// Finds the connected components (4 neighbours) of the pixels that `keep` accepts; calls `each` with the pixels of each.
 pub(crate) fn components(grid: &Grid, keep: impl Fn(f32) -> bool, mut each: impl FnMut(&[usize])) {
     let (width, height) = (grid.width, grid.height);
     let mut done = vec![false; width * height];
@@ -238,8 +241,8 @@ pub(crate) fn components(grid: &Grid, keep: impl Fn(f32) -> bool, mut each: impl
     }
 }
 
-/// Keeps the largest piece above one half (and pieces at least a fifth as large: an arm cut off by a strap),
-/// and fills holes smaller than a disc of `hole_radius`.
+/// Keeps the largest component above one half and those at least a fifth as large (an arm cut off by a strap), and fills
+/// holes smaller than a disc of `hole_radius` pixels.
 pub(crate) fn clean(grid: &mut Grid, hole_radius: usize) {
     let mut sizes = Vec::new();
     components(grid, |v| v >= 0.5, |pixels| sizes.push(pixels.len()));
@@ -275,7 +278,7 @@ pub(crate) fn clean(grid: &mut Grid, hole_radius: usize) {
     for at in fill {
         grid.values[at] = 1.0;
     }
-    // What is left of dropped pieces' soft rims: nothing far from a sure pixel.
+    // Soft rims of dropped components: clears everything far from a sure pixel.
     let distance = grid.distance_to_set();
     for (value, d) in grid.values.iter_mut().zip(&distance.values) {
         if *d > 2.0 {

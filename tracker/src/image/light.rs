@@ -30,7 +30,7 @@ pub(crate) fn byte(linear: f32) -> u8 {
     (srgb * 255.0).round() as u8
 }
 
-/// Returns linear light of one sRGB step at a linear value: noise of a step in sRGB is as large as this in light.
+/// Returns the linear light of one sRGB step at a linear value: sRGB noise of one step is as large as this in light.
 pub(crate) fn step(linear: f32) -> f32 {
     let value = linear.clamp(0.0, 1.0);
     let slope = if value <= 0.003_130_8 { 1.0 / 12.92 } else { 2.4 / 1.055 * value.powf(1.4 / 2.4) };

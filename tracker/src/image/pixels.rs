@@ -5,7 +5,7 @@ use std::borrow::Cow;
 use flyrig_types::{Image, PixelFormat};
 use glam::DVec2;
 
-use crate::{TrackError, TrackErrorKind};
+use crate::error::{TrackError, TrackErrorKind};
 
 /// RGB bytes of an image, borrowed where the image already has them.
 #[derive(Debug, Clone)]
@@ -16,6 +16,10 @@ pub(crate) struct Rgb<'a> {
 }
 
 impl<'a> Rgb<'a> {
+    /// Reads an image.
+    ///
+    /// # Errors
+    /// Kind `Image` when the format cannot be read.
     pub fn new(image: &'a Image) -> Result<Self, TrackError> {
         let bytes =
             if image.format() == PixelFormat::Rgb8 {
@@ -28,12 +32,12 @@ impl<'a> Rgb<'a> {
         Ok(Self { width: image.width() as usize, height: image.height() as usize, bytes })
     }
 
-    /// Returns whether the image is uniform except for noise, as with a covered lens.
+    /// Whether the image is uniform except for noise, as with a covered lens.
     pub fn is_blank(&self) -> bool {
-        /// Blocks in each direction whose means are compared, and side of a block, pixels.
+        /// Number of compared blocks in each direction, and side of a block, pixels.
         const BLOCKS: usize = 24;
         const SIDE: usize = 6;
-        /// Standard deviation of the means below which nothing is to be seen, levels of 0 to 255.
+        /// Standard deviation of the blocks' means below which an image is blank, levels of 0 to 255.
         const LEAST: f64 = 2.0;
         if self.width < BLOCKS * SIDE || self.height < BLOCKS * SIDE {
             return false;
@@ -51,12 +55,13 @@ impl<'a> Rgb<'a> {
         variance < LEAST * LEAST
     }
 
+    /// Returns the bytes of a pixel.
     pub fn pixel(&self, x: usize, y: usize) -> [u8; 3] {
         let at = (y * self.width + x) * 3;
         [self.bytes[at], self.bytes[at + 1], self.bytes[at + 2]]
     }
 
-    /// Bilinear sample, 0..=255; black outside.
+    /// Samples bilinearly, 0..=255; black outside the image.
     pub fn bilinear(&self, at: DVec2) -> [f32; 3] {
         if !(at.x > -1.0 && at.y > -1.0 && at.x < self.width as f64 && at.y < self.height as f64) {
             return [0.0; 3];
@@ -88,7 +93,7 @@ impl<'a> Rgb<'a> {
     }
 }
 
-/// Returns whether an image is uniform except for noise, as with a covered lens. It contains neither people nor background.
+/// Whether an image is uniform except for noise, as with a covered lens. It contains neither people nor background.
 ///
 /// # Errors
 /// Kind `Image` when the format cannot be read.

@@ -1,14 +1,14 @@
-//! One camera as the fit needs it: rays of pixels and projection on the undistorted plane.
+//! A camera as the solver sees it: projection onto the undistorted image plane, and undistorted landmarks.
 
 use flyrig_types::Camera;
 use glam::{DMat3, DVec2, DVec3};
 
-use crate::{LANDMARK_COUNT, ViewKeypoints};
+use crate::landmarks::keypoints::{LANDMARK_COUNT, ViewKeypoints};
 
-/// Closest distance to the camera's plane that a point may have to be projected, metres.
+/// Least depth of a point that is projected, metres.
 const NEAR_M: f64 = 0.1;
 
-/// An undistorted camera: world to camera, and pixels by the mean focal length.
+/// Undistorted camera: extrinsics (camera from world) and the mean focal length.
 #[derive(Debug, Clone)]
 pub(crate) struct View {
     pub rotation: DMat3,
@@ -17,6 +17,7 @@ pub(crate) struct View {
 }
 
 impl View {
+    /// Returns the undistorted view of a camera.
     pub fn new(camera: &Camera) -> Self {
         Self {
             rotation: DMat3::from_quat(camera.camera_from_world.rotation),
@@ -25,23 +26,23 @@ impl View {
         }
     }
 
-    /// Camera coordinates of a world point; `None` when it is not in front of the camera.
+    /// Returns the camera coordinates of a world point, metres; `None` when it is not in front of the camera.
     pub fn to_camera(&self, world: DVec3) -> Option<DVec3> {
         let point = self.rotation * world + self.translation;
         (point.is_finite() && point.z > NEAR_M).then_some(point)
     }
 
-    /// Undistorted pixel offset from the principal point.
+    /// Projects a world point to undistorted pixels from the principal point.
     pub fn project(&self, world: DVec3) -> Option<DVec2> {
         self.to_camera(world).map(|p| p.truncate() * (self.focal_px / p.z))
     }
 
-    /// Pixels that a metre takes at a world point.
+    /// Returns the image scale at a world point, undistorted pixels per metre.
     pub fn px_per_m(&self, world: DVec3) -> Option<f64> {
         self.to_camera(world).map(|p| self.focal_px / p.z)
     }
 
-    /// The same with its derivative by the world point (rows: du, dv).
+    /// Returns [`Self::project`] and its derivative by the world point (rows: du, dv).
     pub fn project_with_derivative(&self, world: DVec3) -> Option<(DVec2, [DVec3; 2])> {
         let p = self.to_camera(world)?;
         let scale = self.focal_px / p.z;
@@ -52,30 +53,32 @@ impl View {
         Some((ideal * self.focal_px, [du, dv]))
     }
 
-    /// Undistorted place of a pixel of this view's camera: pixels from the principal point. `None` where the lens model has
-    /// none.
+    /// Undistorts a pixel of this view's camera, pixels from the principal point. `None` where the lens model has no
+    /// inverse.
     pub fn undistorted(&self, camera: &Camera, pixel: DVec2) -> Option<DVec2> {
         let distorted = (pixel - camera.intrinsics.center_px) / camera.intrinsics.focal_px;
         let ideal = camera.intrinsics.lens.undistort(distorted)? * self.focal_px;
         ideal.is_finite().then_some(ideal)
     }
 
-    /// Camera centre in the world.
+    /// Returns the camera's centre in the world, metres.
     pub fn center(&self) -> DVec3 {
         -(self.rotation.transpose() * self.translation)
     }
 }
 
-/// A landmark on the undistorted plane (pixels from the principal point) with its confidence.
+/// Landmark on the undistorted image plane.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub(crate) struct Observation {
+    /// Undistorted pixels from the principal point.
     pub ideal_px: DVec2,
+    /// Confidence of the network, 0..=1.
     pub confidence: f64,
-    /// 1 for a look at this very image, less for one that was carried along, 0..=1.
+    /// Trust by age: 1 where the network ran on this very image, less where the landmark was carried along, 0..=1.
     pub trust: f64,
 }
 
-/// Undistorts the usable landmarks of one view.
+/// Undistorts the usable landmarks of one view whose confidence reaches the threshold.
 pub(crate) fn observe(
     camera: &Camera,
     view: &View,

@@ -7,9 +7,9 @@ use flyrig_body::skin_mesh;
 use glam::{DVec2, DVec3};
 
 use super::*;
-use crate::body_model::BodyModel;
-use crate::crop::Crop;
-use crate::net::{CropLandmark, NET_SIDE, NetOutput};
+use crate::image::crop::Crop;
+use crate::network::output::{CropLandmark, NET_SIDE, NetOutput};
+use crate::pose::body_model::BodyModel;
 use crate::testing::{body, mask_of, random_turns, ring};
 
 /// A network that sees a person on the coverage of an image.

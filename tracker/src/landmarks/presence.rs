@@ -2,9 +2,11 @@
 
 use flyrig_types::Image;
 
-use crate::pixels::Rgb;
-use crate::search::sightings;
-use crate::{PoseConfig, PoseNet, TrackError};
+use crate::error::TrackError;
+use crate::image::pixels::Rgb;
+use crate::landmarks::search::sightings;
+use crate::network::pose_net::PoseNet;
+use crate::pose::config::PoseConfig;
 
 /// Least probability of a person: an empty room has furniture that looks a little like one.
 const SURE: f64 = 0.8;

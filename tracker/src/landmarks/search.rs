@@ -6,14 +6,17 @@ use flyrig_types::Camera;
 use glam::{DVec2, DVec3};
 use rayon::prelude::*;
 
-use crate::background::Background;
-use crate::crop::{Crop, search_crops};
-use crate::grid::{Grid, components};
-use crate::pixels::Rgb;
-use crate::sighting::Sighting;
-use crate::single_view::lift;
-use crate::triangulate::{WorldPoint, triangulate};
-use crate::{LANDMARK_COUNT, PoseConfig, PoseNet, TrackError, ViewKeypoints};
+use crate::error::TrackError;
+use crate::image::crop::{Crop, search_crops};
+use crate::image::grid::{Grid, components};
+use crate::image::pixels::Rgb;
+use crate::landmarks::keypoints::{LANDMARK_COUNT, ViewKeypoints};
+use crate::landmarks::sighting::Sighting;
+use crate::landmarks::single_view::lift;
+use crate::landmarks::triangulate::{WorldPoint, triangulate};
+use crate::masks::background::Background;
+use crate::network::pose_net::PoseNet;
+use crate::pose::config::PoseConfig;
 
 /// Hypotheses kept an image.
 const KEEP: usize = 4;
@@ -315,8 +318,8 @@ pub(crate) fn project_all(camera: &Camera, points: &[DVec3; LANDMARK_COUNT]) -> 
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::body_model::BodyModel;
-    use crate::net::NetOutput;
+    use crate::network::output::NetOutput;
+    use crate::pose::body_model::BodyModel;
     use crate::testing::{body, keypoints_of, random_turns, ring};
 
     const SIDE: usize = 120;

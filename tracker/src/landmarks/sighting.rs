@@ -2,10 +2,12 @@
 
 use glam::DVec2;
 
-use crate::crop::Crop;
-use crate::net::NetOutput;
-use crate::pixels::Rgb;
-use crate::{LANDMARK_COUNT, PoseNet, TrackError, ViewKeypoints};
+use crate::error::TrackError;
+use crate::image::crop::Crop;
+use crate::image::pixels::Rgb;
+use crate::landmarks::keypoints::{LANDMARK_COUNT, ViewKeypoints};
+use crate::network::output::NetOutput;
+use crate::network::pose_net::PoseNet;
 
 /// The network's output for one crop of an image.
 #[derive(Debug, Clone)]

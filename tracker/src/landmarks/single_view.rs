@@ -3,9 +3,9 @@
 use flyrig_types::Camera;
 use glam::{DMat3, DVec2, DVec3, Vec3};
 
-use crate::LANDMARK_COUNT;
-use crate::sighting::Sighting;
-use crate::view::{View, observe};
+use crate::image::view::{View, observe};
+use crate::landmarks::keypoints::LANDMARK_COUNT;
+use crate::landmarks::sighting::Sighting;
 
 /// World points from one view: the network's hip-centred landmarks (in metres, for a trunk of half a
 /// metre; times `scale`), turned by the crop, moved to where they explain the image best (linear least squares).

@@ -3,12 +3,12 @@
 use flyrig_body::{SkinWeights, Template};
 use glam::DVec3;
 
-use crate::anatomy::Roles;
-use crate::landmarks::{
-    LEFT_ANKLE, LEFT_ELBOW, LEFT_HEEL, LEFT_HIP, LEFT_INDEX, LEFT_KNEE, LEFT_LITTLE, LEFT_SHOULDER, LEFT_THUMB,
-    LEFT_TOES, LEFT_WRIST, NOSE,
+use crate::error::{TrackError, TrackErrorKind};
+use crate::landmarks::keypoints::{
+    LANDMARK_COUNT, LEFT_ANKLE, LEFT_ELBOW, LEFT_HEEL, LEFT_HIP, LEFT_INDEX, LEFT_KNEE, LEFT_LITTLE, LEFT_SHOULDER,
+    LEFT_THUMB, LEFT_TOES, LEFT_WRIST, NOSE,
 };
-use crate::{LANDMARK_COUNT, TrackError, TrackErrorKind};
+use crate::pose::anatomy::Roles;
 
 /// A canonical point of the template that moves with one joint.
 #[derive(Debug, Clone, Copy, PartialEq, Default)]

@@ -3,8 +3,8 @@
 use flyrig_types::Camera;
 use glam::{DMat3, DVec2, DVec3};
 
-use crate::view::{Observation, View, observe};
-use crate::{LANDMARK_COUNT, ViewKeypoints};
+use crate::image::view::{Observation, View, observe};
+use crate::landmarks::keypoints::{LANDMARK_COUNT, ViewKeypoints};
 
 /// Smallest angle between two rays that fixes a point, radians.
 const MIN_PARALLAX: f64 = 0.03;
@@ -151,7 +151,7 @@ fn polish(views: &[View], seen: &[(usize, Observation)], start: DVec3, inlier_m:
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::Keypoint;
+    use crate::landmarks::keypoints::Keypoint;
     use crate::testing::{keypoints_of, ring};
 
     fn points() -> [DVec3; LANDMARK_COUNT] {

@@ -1,38 +1,37 @@
-//! Where a mask may be: near the posed body.
+//! The region of an image that a posed body and its clothes may cover.
 
 use flyrig_types::{Camera, Mask};
 use glam::{DVec2, Vec3};
 use rayon::prelude::*;
 
-use crate::grid::Grid;
+use crate::image::grid::Grid;
 
-/// Distance of most clothes and hair from the fitted body, metres: the unit of a gate's distances.
+/// Reach of most clothes and hair beyond the fitted body, metres: the unit of a gate's distances.
 const REACH_M: f64 = 0.13;
-/// Distance of wide skirts and coats, as a multiple of it: beyond 1, only where image and background speak for it.
+/// Reach of wide skirts and coats in that unit; beyond 1 a mask needs evidence from image and background.
 const CLOTHES_REACH: f32 = 2.5;
-/// The same of clothes whose skirt, if there is one, is part of the body that was drawn: hair and loose sleeves are left.
+/// Reach once the clothes are known, in that unit: a skirt is part of the drawn body, hair and loose sleeves remain.
 const KNOWN_CLOTHES_REACH: f32 = 1.5;
 
-/// Region of an image that a posed body and its clothes may cover.
+/// Region of an image around a posed body.
 #[derive(Debug, Clone)]
 pub struct BodyGate {
     /// Width and height of the image.
     pub(crate) image: [usize; 2],
-    /// Box that holds everything allowed: x0, y0, x1, y1 (ends excluded).
+    /// Bounding box of the region, pixels: x0, y0, x1, y1 (ends excluded).
     pub(crate) bounds: [usize; 4],
-    /// Distance to the projected body in units of [`REACH_M`], 0 on the body; the size of the box.
+    /// Distance to the projected body in units of [`REACH_M`], 0 on the body; covers the box.
     pub(crate) distance: Grid,
-    /// Pixels that a metre takes at the body.
+    /// Image scale at the body, pixels per metre.
     pub(crate) px_per_m: f64,
-    /// Distance at which nothing belongs to the person, in the unit of `distance`.
+    /// Distance beyond which no pixel belongs to the person, in the unit of `distance`.
     pub(crate) reach: f32,
     /// Least and greatest depth of the body in the camera, metres.
     pub(crate) depths_m: [f64; 2],
 }
 
 impl BodyGate {
-    /// Projects the world vertices (metres) and triangles of one or several bodies; `None` when nothing of them is in the
-    /// image.
+    /// Projects the world vertices (metres) and triangles of one or several bodies; `None` when they are out of the image.
     #[must_use]
     pub fn new(camera: &Camera, vertices: &[Vec3], triangles: &[[u32; 3]]) -> Option<Self> {
         let mut depths: Vec<f64> = vertices
@@ -54,19 +53,19 @@ impl BodyGate {
         Some(Self { image, bounds, distance, px_per_m, reach: CLOTHES_REACH, depths_m })
     }
 
-    /// Returns the gate of a body that is drawn in its clothes, once these are known: it reaches less far.
+    /// Returns the narrower gate of a body that was drawn in its known clothes.
     #[must_use]
     pub fn of_known_clothes(self) -> Self {
         Self { reach: KNOWN_CLOTHES_REACH, ..self }
     }
 
-    /// Depths along the camera's axis between which person and clothes may be, metres.
+    /// Returns the range of depths along the camera's axis that person and clothes may occupy, metres.
     pub(crate) fn depth_range_m(&self) -> [f64; 2] {
         let reach = REACH_M * f64::from(self.reach);
         [(self.depths_m[0] - reach).max(0.05), self.depths_m[1] + reach]
     }
 
-    /// The unit of [`Self::distance`], pixels.
+    /// Returns the unit of [`Self::distance`], pixels.
     pub(crate) fn unit_px(&self) -> f64 {
         REACH_M * self.px_per_m
     }
@@ -79,12 +78,12 @@ impl BodyGate {
             && self.distance.values[(y - y0) * self.distance.width + x - x0] < self.reach
     }
 
-    /// The same of a pixel's index, row by row.
+    /// Whether the pixel of an index, row by row, may show the body or its clothes.
     pub(crate) fn reaches_pixel(&self, pixel: usize) -> bool {
         self.reaches(pixel % self.image[0], pixel / self.image[0])
     }
 
-    /// The gate of a body drawn as 1 in a grid of the image's size.
+    /// Returns the gate of a body drawn as 1 in a grid of the image's size.
     #[cfg(test)]
     pub(crate) fn of_grid(body: &Grid, px_per_m: f64) -> Self {
         let mut distance = body.distance_to_set();
@@ -99,7 +98,7 @@ impl BodyGate {
         }
     }
 
-    /// Intersection over union of a mask of the whole image and the body's outline.
+    /// Returns the intersection over union of a mask of the whole image and the projected body.
     pub(crate) fn overlap(&self, mask: &Mask) -> f64 {
         let [x0, y0, ..] = self.bounds;
         let (mut both, mut body) = (0usize, 0usize);
@@ -114,11 +113,11 @@ impl BodyGate {
     }
 }
 
-/// Vertices that one task projects.
+/// Vertices per parallel task.
 const VERTICES_A_TASK: usize = 2048;
 
-/// Draws a posed body: the box around it with a margin in pixels (x0, y0, x1, y1, ends excluded), and 1 on the body inside
-/// that box. `None` when nothing of it is in the image.
+/// Draws a posed body (world vertices, metres). Returns its bounding box with a margin in pixels (x0, y0, x1, y1, ends excluded) and
+/// a grid of that box that is 1 on the body; `None` when the body is out of the image.
 pub(crate) fn drawn_body(
     camera: &Camera,
     vertices: &[Vec3],

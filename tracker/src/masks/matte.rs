@@ -2,48 +2,68 @@
 //!
 //! A pixel on the outline shows alpha F + (1 - alpha) B, in linear light. The background B is the plate, brought to the
 //! exposure and the shadow of the surely empty pixels nearby, or else their colour; the foreground F comes from the nearest
-//! pixels well inside of the mask. Where F and B are alike, alpha stays that of the mask.
+//! pixels well inside the mask. Where F and B are alike, alpha stays that of the mask.
 
 use flyrig_types::{Image, Mask};
 use rayon::prelude::*;
 
-use crate::TrackError;
-use crate::background::{Background, BackgroundLight};
-use crate::edge_color::{EdgeColor, Matte};
-use crate::grid::Grid;
-use crate::light::{byte, linear_of_bytes, step};
-use crate::pixels::Rgb;
+use crate::error::TrackError;
+use crate::image::grid::Grid;
+use crate::image::light::{byte, linear_of_bytes, step};
+use crate::image::pixels::Rgb;
+use crate::masks::background::Background;
+use crate::masks::background_light::BackgroundLight;
+use crate::masks::edge_color::{EdgeColor, Matte};
 
-/// Distance from the mask's outline up to which alpha is solved for, pixels.
+/// Half width of the band around the outline in which alpha is solved for, pixels.
 const BAND_PX: f32 = 3.4;
-/// Pixels of thin parts count as surely inside from this distance to the outline on.
+/// Least depth of a pixel of a thin part that counts as surely inside, pixels.
 const THIN_PX: f32 = 1.9;
-/// Width of the surroundings of the mask from which the background is learnt, pixels.
+/// Width of the surroundings of the mask that show the background, pixels.
 const MARGIN_PX: usize = 14;
-/// Half of the side of the square in which the background's exposure is compared with the plate's, pixels.
+/// Half side of the square in which the background's exposure is compared with the plate's, pixels.
 const LOCAL_PX: usize = 7;
-/// Places around the nearest sure pixel from which colours are tried, pixels.
+/// Offsets from the nearest sure pixel at which colours are sampled, pixels.
 const TRIED: [(i64, i64); 9] = [(0, 0), (-2, 0), (2, 0), (0, -2), (0, 2), (-2, -2), (2, -2), (-2, 2), (2, 2)];
 /// Standard deviation of a pixel's colour, sRGB steps.
 const NOISE: f32 = 3.0;
-/// Contrast of foreground and background, in standard deviations, at which the solved alpha is half believed.
+/// Contrast of foreground and background at which the solved alpha gets half the weight, standard deviations.
 const HALF_BELIEVED: f32 = 4.0;
-/// Weight of the part of a pixel that foreground and background do not explain, as doubt about its alpha.
+/// Weight of the unexplained part of a pixel in the doubt about its alpha.
 const REMAINDER: f32 = 60.0;
 /// Weight of differences in colour beside those in brightness.
 const CHROMA: f32 = 0.8;
-/// Farthest that an outline is blurred, pixels.
+/// Largest half width of a blurred outline, pixels.
 const BLUR_PX: f32 = 1.7;
-/// Shares of its light that a shadow leaves to the background, and how much better a mixture has to explain a pixel beyond the
-/// mask than a shadow does, squared standard deviations.
+/// Range of the share of its light that a shadow leaves to the background, and the margin by which a mixture must explain a pixel
+/// beyond the mask better than a shadow does, squared standard deviations.
 const SHADOWS: std::ops::RangeInclusive<f32> = 0.15..=1.05;
 const BETTER_THAN_SHADOW: f32 = 4.0;
-/// Pixels of the mask that look like the background are solved for up to this depth, pixels, as far as evidence is lower.
+/// Largest depth of a mask pixel that is solved for because it looks like the background, pixels, and the evidence below which
+/// it does.
 const DEEP_PX: f32 = 24.0;
 const LOOKS_EMPTY: f32 = 0.4;
 
-/// Solves for coverage and foreground colour along the outline of a mask. Without a background, or where it is of another
-/// size, the colours around the mask stand in.
+/// Solves for coverage and foreground colour along the outline of a mask. Without a background, or where it has another size,
+/// the colours around the mask are used.
+///
+/// ```
+/// use flyrig_tracker::matte;
+/// use flyrig_types::{Image, Mask, PixelFormat};
+///
+/// // A dark square before a light wall, and a mask that is two pixels too wide.
+/// let dark = |at: usize| (20..44).contains(&(at % 64)) && (20..44).contains(&(at / 64));
+/// let wide = |at: usize| (18..46).contains(&(at % 64)) && (18..46).contains(&(at / 64));
+/// let bytes = (0..64 * 64).flat_map(|at| if dark(at) { [20, 30, 60] } else { [200, 190, 170] }).collect();
+/// let image = Image::new(64, 64, PixelFormat::Rgb8, bytes)?;
+/// let mask = Mask::new(64, 64, (0..64 * 64).map(|at| 255 * u8::from(wide(at))).collect())?;
+///
+/// let solved = matte(&image, &mask, None)?;
+/// let before = mask.coverage()[32 * 64 + 18];
+/// let after = solved.mask.coverage()[32 * 64 + 18];
+/// assert!(before == 255 && after < 64, "the wall beside the square is no longer covered: {after}");
+/// # Ok::<(), Box<dyn std::error::Error>>(())
+/// ```
 ///
 /// # Errors
 /// Kind `Image` when the format cannot be read or the mask is of another size.
@@ -51,7 +71,7 @@ pub fn matte(image: &Image, mask: &Mask, background: Option<&Background>) -> Res
     let picture = Rgb::new(image)?;
     if (mask.width() as usize, mask.height() as usize) != (picture.width, picture.height) {
         return Err(TrackError::new(
-            crate::TrackErrorKind::Image,
+            crate::error::TrackErrorKind::Image,
             format!(
                 "the mask is {}x{} but the image {}x{}",
                 mask.width(),
@@ -71,34 +91,34 @@ pub fn matte(image: &Image, mask: &Mask, background: Option<&Background>) -> Res
     Ok(matte)
 }
 
-/// The surroundings of a mask's outline.
+/// Surroundings of a mask's outline.
 struct Band<'a> {
     picture: &'a Rgb<'a>,
     x0: usize,
     y0: usize,
     width: usize,
     height: usize,
-    /// Linear light of the image's pixels.
+    /// Linear light of the pixels.
     light: Vec<[f32; 3]>,
-    /// Distance of pixels in the mask to the nearest one outside, and the other way round; 0 on the other side.
+    /// Distance of pixels in the mask to the nearest one outside, and of pixels outside to the mask; 0 on the other side.
     inner: Grid,
     outer: Grid,
-    /// Nearest pixel that surely shows the foreground alone, and the background alone.
+    /// Nearest pixel that surely shows the foreground alone, and the nearest that shows the background alone.
     nearest_inside: Vec<u32>,
     nearest_outside: Vec<u32>,
     /// Pixels of the mask that look like the background.
     empty: Vec<bool>,
-    /// Background's linear light where it is known.
+    /// Linear light of the background where it is known.
     behind: Vec<Option<[f32; 3]>>,
 }
 
-/// No pixel.
+/// Marks a missing pixel.
 const NONE: u32 = u32::MAX;
-/// Pixels that one task takes.
+/// Pixels per parallel task.
 const PIXELS_A_TASK: usize = 8192;
 
 impl<'a> Band<'a> {
-    /// `None` for a mask without an outline.
+    /// Measures the surroundings of a mask; `None` for an empty mask.
     fn new(picture: &'a Rgb<'a>, mask: &Mask, background: Option<&Background>) -> Option<Self> {
         let inside = |x: usize, y: usize| mask.coverage()[y * picture.width + x] >= 128;
         let [x0, y0, x1, y1] = mask.bounding_box()?.map(|v| v as usize);
@@ -167,7 +187,7 @@ impl<'a> Band<'a> {
         near(y, self.height).all(|v| near(x, self.width).all(|u| self.inner.values[v * self.width + u] <= depth))
     }
 
-    /// The background's light, brought to the exposure and shadow of the sure background nearby.
+    /// Returns the background's light, scaled to the exposure and shadow of the sure background nearby.
     fn local_background(&self, background: &BackgroundLight<'_>, sure: &[bool]) -> Vec<Option<[f32; 3]>> {
         let behind: Vec<Option<[f32; 3]>> = (0..self.light.len()).map(|at| background.at(self.pixel(at))).collect();
         let mean = |value: &(dyn Fn(usize, [f32; 3]) -> f32 + Sync)| {
@@ -178,7 +198,7 @@ impl<'a> Band<'a> {
         let ratio = |k: usize| {
             let (mut now, plate) =
                 rayon::join(|| mean(&|at, _| self.light[at][k]), || mean(&|_, light: [f32; 3]| light[k]));
-            // Without sure background nearby the plate stands as it is.
+            // Without sure background nearby the plate is used unscaled.
             now.values.iter_mut().zip(&plate.values).for_each(|(now, plate)| *now = (*now + 2e-3) / (plate + 2e-3));
             now
         };
@@ -190,16 +210,17 @@ impl<'a> Band<'a> {
         behind.iter().enumerate().map(scaled).collect()
     }
 
-    /// Index in the image of a pixel of the band.
+    /// Returns the index in the image of a pixel of the band.
     fn pixel(&self, at: usize) -> usize {
         (self.y0 + at / self.width) * self.picture.width + self.x0 + at % self.width
     }
 
-    /// Whether coverage is solved for.
+    /// Whether coverage is solved for at a pixel.
     fn is_open(&self, at: usize) -> bool {
         self.inner.values[at].max(self.outer.values[at]) <= BAND_PX || self.empty[at]
     }
 
+    /// Solves for the coverage and colours of all open pixels.
     fn solve(&self, mask: &Mask) -> Matte {
         let mut coverage = mask.coverage().to_vec();
         let pixels = (0..self.light.len()).into_par_iter().with_min_len(PIXELS_A_TASK);
@@ -230,9 +251,9 @@ impl<'a> Band<'a> {
         Matte { mask: Mask::new(mask.width(), mask.height(), coverage).unwrap_or_else(|_| mask.clone()), colors }
     }
 
-    /// Foreground colour of a pixel of the given coverage.
+    /// Returns the foreground colour of a pixel with the given coverage.
     fn foreground(&self, at: usize, alpha: f32, mixed: &Mixed) -> [u8; 3] {
-        // Little coverage says little about the colour.
+        // Low coverage hardly constrains the colour.
         let solved = (1.5 * alpha - 0.25).clamp(0.0, 1.0);
         std::array::from_fn(|k| {
             let seen = self.light[at][k];
@@ -242,7 +263,7 @@ impl<'a> Band<'a> {
         })
     }
 
-    /// Best explanation of a pixel by a foreground and a background nearby.
+    /// Returns the best explanation of a pixel as a mixture of a foreground and a background nearby.
     fn unmix(&self, at: usize) -> Option<Mixed> {
         let seen = self.light[at];
         let mut best: Option<(f32, Mixed)> = None;
@@ -295,7 +316,7 @@ impl<'a> Band<'a> {
         if SHADOWS.contains(&share) { dot(left, left) / (noise * noise) } else { f32::INFINITY }
     }
 
-    /// Colours around the nearest sure pixel, each the mean of three by three.
+    /// Samples colours around the nearest sure pixel, each the mean of 3x3 pixels.
     fn samples<'b>(
         &'b self,
         nearest: &[u32],
@@ -309,7 +330,7 @@ impl<'a> Band<'a> {
         steps.iter().filter_map(move |(dx, dy)| self.mean_around(x + dx, y + dy, depth, least))
     }
 
-    /// Mean light of the pixels around one that are no nearer to the outline than `least`.
+    /// Returns the mean light of the 3x3 pixels around one that are no nearer to the outline than `least`.
     fn mean_around(&self, x: i64, y: i64, depth: &Grid, least: f32) -> Option<[f32; 3]> {
         let (width, height) = (self.width as i64, self.height as i64);
         if x < 0 || y < 0 || x >= width || y >= height || depth.values[(y * width + x) as usize] < least {
@@ -329,7 +350,7 @@ impl<'a> Band<'a> {
     }
 }
 
-/// Sets alpha to 0 or 1 farther from the solved outline than a lens blurs it. There, a mixture is a shade of the foreground or a
+/// Sets alpha to 0 or 1 beyond the blur of a lens around the solved outline: there, a mixture is a shade of the foreground or a
 /// shadow on the background.
 fn sharpen(alphas: &mut Grid) {
     let mut unset = alphas.clone();
@@ -344,16 +365,17 @@ fn sharpen(alphas: &mut Grid) {
     }
 }
 
-/// A pixel as a mixture.
+/// Pixel as a mixture.
 struct Mixed {
     alpha: f32,
     foreground: [f32; 3],
     background: [f32; 3],
-    /// Belief in the mixture, 0..=1.
+    /// Weight of the mixture against the mask's own coverage, 0..=1.
     belief: f32,
 }
 
-/// Returns brightness and two differences of colour, which cameras and codecs blur over the outline.
+/// Returns weighted brightness and two colour differences; the latter count less, since cameras and codecs blur them over the
+/// outline.
 fn weighted([red, green, blue]: [f32; 3]) -> [f32; 3] {
     let light = 0.3 * red + 0.59 * green + 0.11 * blue;
     [1.7 * light, CHROMA * (red - light), CHROMA * (blue - light)]
@@ -363,11 +385,11 @@ fn dot(a: [f32; 3], b: [f32; 3]) -> f32 {
     a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
 }
 
-/// Returns for each pixel the index of the nearest one that is set, by the chamfer distance; [`NONE`] when none is.
+/// Returns the index of the nearest set pixel for each pixel, by the chamfer distance; [`NONE`] when none is set.
 fn nearest(set: &[bool], width: usize, height: usize) -> Vec<u32> {
     const SIDE: u64 = 3 << 32;
     const DIAGONAL: u64 = 4 << 32;
-    // The distance above the label: the smaller number is nearer.
+    // Distance in the upper bits, index in the lower: the smaller number is nearer.
     const FAR: u64 = (1 << 62) | NONE as u64;
     let start = |(at, set): (usize, &bool)| if *set { at as u64 } else { FAR };
     let mut labels: Vec<u64> = set.iter().enumerate().map(start).collect();
@@ -395,10 +417,10 @@ fn nearest(set: &[bool], width: usize, height: usize) -> Vec<u32> {
 
 #[cfg(test)]
 mod tests {
-    use flyrig_types::{Intrinsics, Isometry, Lens, PixelFormat};
-    use glam::DVec2;
+    use flyrig_types::PixelFormat;
 
     use super::*;
+    use crate::testing::small_camera;
 
     const SIDE: usize = 64;
     const SHIRT: [f32; 3] = [0.05, 0.08, 0.35];
@@ -432,20 +454,7 @@ mod tests {
     }
 
     fn background(plate: &Image) -> Background {
-        let camera = flyrig_types::Camera {
-            time_offset_nanos: 0,
-            color: Default::default(),
-            id: "a".into(),
-            intrinsics: Intrinsics {
-                width: plate.width(),
-                height: plate.height(),
-                focal_px: DVec2::splat(60.0),
-                center_px: DVec2::splat(32.0),
-                lens: Lens::PINHOLE,
-            },
-            camera_from_world: Isometry::IDENTITY,
-        };
-        Background::from_plate(&camera, plate).unwrap()
+        Background::from_plate(&small_camera("a", plate.width() as usize), plate).unwrap()
     }
 
     /// Mean error of alpha within two pixels of the true outline, away from the borders.

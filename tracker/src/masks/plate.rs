@@ -1,299 +1,179 @@
-//! Differences of an image from the empty scene of the same camera, and masks from them.
+//! The plate: an image of the empty scene that follows the room.
+//!
+//! Pixels that no person reaches follow slow changes of the light. A pixel that differs for long is relearnt, all pixels are
+//! after a sudden change of most of them (a switched lamp) or a shift (a camera that was moved). An unknown pixel counts as
+//! known once it has kept its colour for a while.
 
-use flyrig_solve::median;
-use flyrig_types::{Image, Mask};
-use rayon::prelude::*;
+use crate::image::pixels::Rgb;
+use crate::masks::background_event::BackgroundEvent;
+use crate::masks::drift::Drift;
+use crate::masks::person_area::{PersonArea, Shows, classify};
+use crate::masks::plate_evidence::plate_evidence;
+use crate::masks::plate_shift::find_shift;
 
-use crate::gate::BodyGate;
-use crate::grid::{Grid, clean, components};
-use crate::pixels::Rgb;
-use crate::{TrackError, TrackErrorKind};
+/// Share of the known pixels away from people that differ from the plate when the whole room has changed.
+const ALL_CHANGED: f32 = 0.4;
+/// Share of the image that must be known and away from people to judge the whole room by it.
+const LEAST_AWAY: f32 = 0.2;
+/// Updates for which an unknown pixel must keep its colour to become known.
+const STEADY_UPDATES: u8 = 8;
+/// Change of a channel between updates that is no noise, sRGB steps.
+const STEADY: f32 = 14.0;
+/// Updates for which a pixel away from people must differ from the plate to be relearnt.
+const DIFFERENT_UPDATES: u8 = 15;
+/// Share of the difference that the plate adopts per update.
+const FOLLOW: f32 = 1.0 / 16.0;
+/// Period, in updates, in which pixels near a person are learnt: a part of the person that the mask misses has time to move.
+const CLEAR_EVERY: u32 = 4;
+/// Updates for which a background that is being learnt asks for every image.
+const EAGER_UPDATES: u32 = 60;
+/// Share of the image that must differ where no person stands to be reported.
+const REPORTED: f32 = 0.003;
+/// Share of the pixels away from people that must be known again after a change.
+const RECOVERED: f32 = 0.7;
 
-/// A shadow darkens the plate to no less than this share, keeping its colour.
-const SHADOW: f32 = 0.45;
-/// Noise is believed to be at least this large, sRGB steps.
-const MIN_NOISE: f32 = 2.0;
-/// The exposure's drift is measured at every so many pixels.
-const GAIN_STEP: usize = 17;
-/// Channels outside of this range are clipped or mostly noise, and measure no gain.
-const GAIN_RANGE: std::ops::RangeInclusive<f32> = 16.0..=245.0;
-/// Limits of the exposure's drift.
-const GAIN_LIMITS: (f32, f32) = (0.6, 1.6);
-/// Samples that a gain needs.
-const GAIN_SAMPLES: usize = 40;
-/// Evidence added on the body, and inside of it by its depth over [`DEEP_M`]; taken off where most clothes end, and beyond.
-const ON_BODY: f32 = 0.15;
-const DEEP_IN_BODY: f32 = 0.35;
-const OFF_BODY: f32 = 0.4;
-/// Evidence where the background is not known.
-pub(crate) const NO_EVIDENCE: f32 = 0.5;
-/// Depth in the body, metres, from which only a sure difference of the image speaks against a person.
-const DEEP_M: f64 = 0.04;
+/// Image of the empty scene that is kept up to date.
+#[derive(Debug, Clone)]
+pub(crate) struct Plate {
+    /// sRGB values, three per pixel.
+    values: Vec<f32>,
+    /// Updates for which each pixel has kept its colour, up to [`STEADY_UPDATES`], where it counts as known.
+    steady: Vec<u8>,
+    /// Updates for which each known pixel has differed from the plate.
+    different: Vec<u8>,
+    /// Whether the plate is being relearnt after the whole room changed.
+    renewing: bool,
+    /// Whether the plate has been tested for a shift, and whether a difference has been reported.
+    compared: bool,
+    reported: bool,
+    /// Updates since the start, or since all pixels were forgotten.
+    updates: u32,
+}
 
-/// Returns the person's mask in an image from the empty scene of the same camera and the posed body; `None` when nothing
-/// stands out near the body.
-///
-/// A pixel's colour is split into brightness along the plate's colour and a remainder (Horprasert et al. 1999): a remainder
-/// beyond the image's own noise, or a brightness that no shadow explains, is foreground, unless it lies out of the gate's
-/// reach. Farther away than most clothes hang, only what surely differs and touches something nearer counts: a wide skirt.
-/// Large pieces stay, small holes are filled.
-///
-/// # Errors
-/// Kind `Image` when the sizes differ or a format cannot be read.
-pub fn mask_from_plate(image: &Image, plate: &Image, gate: &BodyGate) -> Result<Option<Mask>, TrackError> {
-    let (picture, plate) = (Rgb::new(image)?, Rgb::new(plate)?);
-    for (width, height, whose) in
-        [(plate.width, plate.height, "plate"), (gate.image[0], gate.image[1], "camera's calibration")]
-    {
-        if (picture.width, picture.height) != (width, height) {
-            return Err(TrackError::new(
-                TrackErrorKind::Image,
-                format!(
-                    "the image is {}x{} but the {whose} {width}x{height}; take the plate with the same camera settings",
-                    picture.width, picture.height
-                ),
-            ));
+impl Plate {
+    /// Returns a plate without a known pixel.
+    pub fn unknown(width: usize, height: usize) -> Self {
+        Self {
+            values: vec![0.0; 3 * width * height],
+            steady: vec![0; width * height],
+            different: vec![0; width * height],
+            renewing: false,
+            compared: true,
+            reported: false,
+            updates: 0,
         }
     }
-    let plate = floats(&plate);
-    let drift = Drift::new(&picture, &plate, &|at| !gate.reaches_pixel(at));
-    let evidence = plate_evidence(&picture, &plate, &drift, gate.bounds);
-    Ok(evidence.and_then(|evidence| gated_mask(&evidence, gate)))
-}
 
-/// Returns the mask that evidence ([`plate_evidence`], in the gate's bounds) and the body give together.
-pub(crate) fn gated_mask(evidence: &Grid, gate: &BodyGate) -> Option<Mask> {
-    let ([x0, y0, ..], [width, height]) = (gate.bounds, gate.image);
-    if (evidence.width, evidence.height) != (gate.distance.width, gate.distance.height) {
-        return None;
-    }
-    // A vote among neighbours removes specks and closes pinholes.
-    let mut voted = evidence.box_mean(1);
-    let mut outside = gate.distance.clone();
-    outside.values.iter_mut().for_each(|d| *d = f32::from(*d > 0.0));
-    let depth = outside.distance_to_set();
-    let deep_px = (DEEP_M * gate.px_per_m).max(1.0) as f32;
-    for ((value, distance), depth) in voted.values.iter_mut().zip(&gate.distance.values).zip(&depth.values) {
-        let prior = if *distance > 0.0 {
-            ON_BODY - (ON_BODY + OFF_BODY) * distance.min(1.0)
-        } else {
-            ON_BODY + DEEP_IN_BODY * (depth / deep_px).min(1.0)
-        };
-        let is_out = *distance >= gate.reach;
-        *value = if is_out { 0.0 } else { ((*value + prior - 0.5) * 2.0 + 0.5).clamp(0.0, 1.0) };
-    }
-    drop_what_hangs_on_nothing(&mut voted, &gate.distance);
-    clean(&mut voted, (0.02 * gate.px_per_m).round().max(2.0) as usize);
-    let least = (width * height / 5000).max(12);
-    if voted.values.iter().filter(|v| **v >= 0.5).count() < least {
-        return None;
-    }
-    voted.paste(width, height, x0, y0)
-}
-
-/// Clears pieces that lie farther from the body than most clothes as a whole: other things than a person's clothes.
-fn drop_what_hangs_on_nothing(voted: &mut Grid, distance: &Grid) {
-    let mut alone = Vec::new();
-    let take_alone = |pixels: &[usize]| {
-        if pixels.iter().all(|at| distance.values[*at] >= 1.0) {
-            alone.extend_from_slice(pixels);
+    /// Returns the plate of an image of the empty scene.
+    pub fn recorded(picture: &Rgb) -> Self {
+        Self {
+            values: picture.bytes.iter().map(|byte| f32::from(*byte)).collect(),
+            steady: vec![STEADY_UPDATES; picture.width * picture.height],
+            compared: false,
+            updates: EAGER_UPDATES,
+            ..Self::unknown(picture.width, picture.height)
         }
-    };
-    components(voted, |value| value >= 0.5, take_alone);
-    alone.into_iter().for_each(|at| voted.values[at] = 0.0);
-}
-
-/// Returns an image's bytes as numbers.
-pub(crate) fn floats(picture: &Rgb) -> Vec<f32> {
-    picture.bytes.iter().map(|byte| f32::from(*byte)).collect()
-}
-
-/// Exposure of an image relative to a plate.
-#[derive(Debug, Clone, Copy, PartialEq)]
-pub(crate) struct Drift {
-    /// Image over plate, by channel.
-    pub gain: [f32; 3],
-    /// Standard deviation of the background after the gain, sRGB steps.
-    pub noise: f32,
-}
-
-impl Drift {
-    /// Measures the drift at pixels that are known to show the background.
-    pub fn new(picture: &Rgb, plate: &[f32], is_background: &dyn Fn(usize) -> bool) -> Self {
-        let away: Vec<usize> =
-            (0..picture.width * picture.height).step_by(GAIN_STEP).filter(|at| is_background(*at)).collect();
-        let ratio = |k: usize| {
-            let pairs = away.iter().map(|at| (f32::from(picture.bytes[3 * at + k]), plate[3 * at + k]));
-            let usable = pairs.filter(|(now, plate)| GAIN_RANGE.contains(now) && GAIN_RANGE.contains(plate));
-            let mut ratios: Vec<f64> = usable.map(|(now, plate)| f64::from(now / plate)).collect();
-            let enough = ratios.len() >= GAIN_SAMPLES;
-            median(&mut ratios).filter(|_| enough).map(|gain| (gain as f32).clamp(GAIN_LIMITS.0, GAIN_LIMITS.1))
-        };
-        let gains: [Option<f32>; 3] = std::array::from_fn(ratio);
-        // A channel that is dark or clipped everywhere drifts as the others do.
-        let known: Vec<f32> = gains.iter().flatten().copied().collect();
-        let mean = if known.is_empty() { 1.0 } else { known.iter().sum::<f32>() / known.len() as f32 };
-        let gain = gains.map(|gain| gain.unwrap_or(mean));
-        let difference =
-            |at: usize, k: usize| (f32::from(picture.bytes[3 * at + k]) - gain[k] * plate[3 * at + k]).abs();
-        let mut differences: Vec<f64> =
-            away.iter().flat_map(|&at| (0..3).map(move |k| f64::from(difference(at, k)))).collect();
-        let noise = (1.48 * median(&mut differences).unwrap_or(0.0) as f32).clamp(MIN_NOISE, 8.0);
-        Self { gain, noise }
     }
-}
 
-/// Returns per-pixel evidence for a foreground inside of `bounds` (x0, y0, x1, y1, ends excluded), 0..=1 with the border at one
-/// half; `None` when the sizes differ. `plate` holds sRGB values, three a pixel.
-pub(crate) fn plate_evidence(picture: &Rgb, plate: &[f32], drift: &Drift, bounds: [usize; 4]) -> Option<Grid> {
-    let [x0, y0, x1, y1] = bounds;
-    if plate.len() != picture.bytes.len() || x1 > picture.width || y1 > picture.height {
-        return None;
+    /// Returns the sRGB values, three per pixel; those of unknown pixels mean nothing.
+    pub fn values(&self) -> &[f32] {
+        &self.values
     }
-    let Drift { gain, noise } = *drift;
-    let mut grid = Grid::new(x1 - x0, y1 - y0, 0.0);
-    let of_pixel = |(value, (now, plate)): (&mut f32, (&[u8], &[f32]))| {
-        // A dark plate has no colour to speak of: lift it so that the split stays sound.
-        let plate: [f32; 3] = std::array::from_fn(|k| gain[k] * plate[k] + 4.0);
-        let now: [f32; 3] = std::array::from_fn(|k| f32::from(now[k]) + 4.0);
-        let dot = |a: [f32; 3], b: [f32; 3]| a[0] * b[0] + a[1] * b[1] + a[2] * b[2];
-        let length = dot(plate, plate).sqrt();
-        let along = dot(now, plate) / (length * length);
-        let left: [f32; 3] = std::array::from_fn(|k| now[k] - along * plate[k]);
-        let color = dot(left, left).sqrt() / (4.0 * noise);
-        let change = (along - 1.0) * length;
-        let light = if along < SHADOW {
-            // Where feet touch the floor shadows are this dark, too.
-            1.0 + (1.5 * (1.0 - along / SHADOW)).clamp(0.0, 1.0)
-        } else if change > 0.0 {
-            change / (7.0 * noise)
-        } else {
-            // Inside the shadow's range darkening alone is weak evidence.
-            (-change / (16.0 * noise)).min(0.45 + 0.8 * (1.0 - along))
-        };
-        *value = color.max(light).min(2.0) * 0.5;
-    };
-    grid.rows_mut().for_each(|(y, values)| {
-        let row = 3 * ((y + y0) * picture.width + x0)..3 * ((y + y0) * picture.width + x1);
-        let pairs = picture.bytes[row.clone()].chunks_exact(3).zip(plate[row].chunks_exact(3));
-        values.iter_mut().zip(pairs).for_each(of_pixel);
-    });
-    Some(grid)
-}
 
-#[cfg(test)]
-mod tests {
-    use super::*;
-    use flyrig_types::PixelFormat;
-    use rand::{RngExt, SeedableRng, rngs::StdRng};
+    /// Whether the next image is worth an update.
+    pub fn is_learning(&self) -> bool {
+        self.updates < EAGER_UPDATES
+    }
 
-    const SIDE: usize = 96;
+    /// Measures the exposure of an image relative to the plate, at known pixels where `is_background`.
+    pub fn drift(&self, picture: &Rgb, is_background: &dyn Fn(usize) -> bool) -> Drift {
+        Drift::new(picture, &self.values, &|at| self.knows(at) && is_background(at))
+    }
 
-    fn picture(paint: impl Fn(usize, usize) -> [f64; 3], seed: u64) -> Image {
-        let mut rng = StdRng::seed_from_u64(seed);
-        let mut bytes = Vec::new();
-        for y in 0..SIDE {
-            for x in 0..SIDE {
-                bytes.extend(paint(x, y).map(|c| (c + rng.random_range(-2.0..2.0)).clamp(0.0, 255.0) as u8));
+    /// Whether the colour of a pixel is known.
+    pub fn knows(&self, pixel: usize) -> bool {
+        self.steady[pixel] >= STEADY_UPDATES
+    }
+
+    /// Ingests an image of the plate's size that shows no person but `people`; see [`crate::Background::update`].
+    pub fn update(&mut self, picture: &Rgb, people: &[PersonArea<'_>]) -> Vec<BackgroundEvent> {
+        let mut events = Vec::new();
+        let width = picture.width;
+        self.updates = self.updates.saturating_add(1);
+        let learns_near = self.updates.is_multiple_of(CLEAR_EVERY);
+        let shows = classify(picture, people, learns_near);
+        let away: Vec<bool> = shows.iter().map(|shows| *shows == Shows::Background).collect();
+        let away_count = away.iter().filter(|away| **away).count();
+        if !self.compared {
+            self.compared = true;
+            if let Some([x, y]) = find_shift(picture, &self.values, &away) {
+                self.forget();
+                events.push(BackgroundEvent::Shifted(x, y));
             }
         }
-        Image::new(SIDE as u32, SIDE as u32, PixelFormat::Rgb8, bytes).unwrap()
-    }
-
-    fn wall(x: usize, y: usize) -> [f64; 3] {
-        [120.0 + x as f64 * 0.5, 130.0 + y as f64 * 0.3, 110.0]
-    }
-
-    fn person(x: usize, y: usize) -> bool {
-        (30..60).contains(&x) && (20..80).contains(&y)
-    }
-
-    /// A gate around a body that is 4 pixels narrower than the person on every side.
-    fn gate() -> BodyGate {
-        BodyGate::of_grid(&body(|x, y| (34..56).contains(&x) && (24..76).contains(&y)), 100.0)
-    }
-
-    fn body(inside: impl Fn(usize, usize) -> bool) -> Grid {
-        let mut grid = Grid::new(SIDE, SIDE, 0.0);
-        for at in 0..SIDE * SIDE {
-            grid.values[at] = f32::from(inside(at % SIDE, at / SIDE));
+        let drift = self.drift(picture, &|at| away[at]);
+        let evidence = plate_evidence(picture, &self.values, &drift, [0, 0, width, picture.height]);
+        let Some(evidence) = evidence else { return events };
+        let known = (0..away.len()).filter(|&at| away[at] && self.knows(at)).count();
+        let differs = |at: usize| away[at] && self.knows(at) && evidence.values[at] >= 0.5;
+        let different = (0..away.len()).filter(|&at| differs(at)).count();
+        let enough = known as f32 > LEAST_AWAY * away.len() as f32;
+        if enough && different as f32 > ALL_CHANGED * known as f32 {
+            self.forget();
+            events.push(BackgroundEvent::Changed(different as f64 / known as f64));
         }
-        grid
-    }
-
-    fn iou(mask: &Mask, truth: impl Fn(usize, usize) -> bool) -> f64 {
-        let (mut both, mut either) = (0, 0);
-        for y in 0..SIDE {
-            for x in 0..SIDE {
-                let found = mask.coverage()[y * SIDE + x] >= 128;
-                both += usize::from(found && truth(x, y));
-                either += usize::from(found || truth(x, y));
-            }
-        }
-        both as f64 / either as f64
-    }
-
-    #[test]
-    fn the_person_is_found_and_neither_the_shadow_nor_things_far_from_the_body() {
-        let plate = picture(wall, 1);
-        let now = picture(
-            |x, y| {
-                if person(x, y) || (78..90).contains(&x) && y < 60 {
-                    [60.0, 60.0, 150.0]
-                } else if (60..85).contains(&x) && y > 60 {
-                    wall(x, y).map(|c| c * 0.7)
-                } else {
-                    wall(x, y)
+        let (mut old, mut center) = (0usize, [0usize; 2]);
+        for at in (0..shows.len()).filter(|&at| shows[at] != Shows::Person) {
+            let now: [f32; 3] = std::array::from_fn(|k| f32::from(picture.bytes[3 * at + k]));
+            if !self.knows(at) {
+                self.learn(at, now);
+            } else if !away[at] {
+                // Known well enough, and too near to a person to be relearnt.
+            } else if evidence.values[at] < 0.5 {
+                self.different[at] = 0;
+                let values = self.values[3 * at..3 * at + 3].iter_mut();
+                for ((value, now), gain) in values.zip(now).zip(drift.gain) {
+                    *value += FOLLOW * (now / gain - *value);
                 }
-            },
-            2,
-        );
-        let mask = mask_from_plate(&now, &plate, &gate()).unwrap().unwrap();
-        assert!(iou(&mask, person) > 0.93, "{}", iou(&mask, person));
+            } else {
+                self.different[at] += 1;
+                if self.different[at] >= DIFFERENT_UPDATES {
+                    (self.different[at], self.steady[at]) = (0, 0);
+                    old += 1;
+                    center = [center[0] + at % width, center[1] + at / width];
+                }
+            }
+        }
+        if old as f32 > REPORTED * away.len() as f32 && !self.reported {
+            self.reported = true;
+            let share = old as f64 / away.len() as f64;
+            events.push(BackgroundEvent::Differs(share, center.map(|sum| (sum / old) as u32)));
+        }
+        let known = (0..away.len()).filter(|&at| away[at] && self.knows(at)).count();
+        if self.renewing && known as f32 > RECOVERED * away_count.max(1) as f32 {
+            self.renewing = false;
+            events.push(BackgroundEvent::Recovered);
+        }
+        events
     }
 
-    #[test]
-    fn a_skirt_that_hangs_on_the_body_is_kept_where_most_clothes_end() {
-        let plate = picture(wall, 1);
-        let skirt = |x: usize, y: usize| person(x, y) || (40..80).contains(&y) && x < 60 + (y - 40) * 3 / 4 && x >= 30;
-        let now = picture(|x, y| if skirt(x, y) { [60.0, 60.0, 150.0] } else { wall(x, y) }, 2);
-        let mask = mask_from_plate(&now, &plate, &gate()).unwrap().unwrap();
-        // 22 pixels from the body are 22 cm; the reach ends at 32.
-        assert!(mask.coverage()[78 * SIDE + 78] >= 128);
-        assert!(iou(&mask, skirt) > 0.93, "{}", iou(&mask, skirt));
-        // Of somebody who wears no skirt it is something else.
-        let mask = mask_from_plate(&now, &plate, &gate().of_known_clothes()).unwrap().unwrap();
-        assert_eq!(mask.coverage()[78 * SIDE + 79], 0);
-        assert!(mask.coverage()[70 * SIDE + 62] >= 128);
+    /// Forgets all pixels, so that the plate is relearnt.
+    fn forget(&mut self) {
+        self.steady.fill(0);
+        self.different.fill(0);
+        (self.renewing, self.updates) = (true, 0);
     }
 
-    #[test]
-    fn an_empty_scene_has_no_mask_off_the_body_even_when_the_exposure_drifts() {
-        let plate = picture(wall, 1);
-        let off_body = BodyGate::of_grid(&body(|x, y| x == 48 && y == 48), 60.0);
-        let mask = |now: &Image, plate: &Image| mask_from_plate(now, plate, &off_body).unwrap();
-        assert_eq!(mask(&picture(wall, 3), &plate), None);
-        let brighter = picture(|x, y| wall(x, y).map(|c| c * 1.15), 4);
-        assert_eq!(mask(&brighter, &plate), None);
-        let warmer = picture(|x, y| std::array::from_fn(|k| wall(x, y)[k] * [1.2, 1.0, 0.8][k]), 4);
-        assert_eq!(mask(&warmer, &plate), None, "white balance drifts by channel");
-        let black = picture(|_, _| [0.0; 3], 5);
-        assert_eq!(mask(&black, &black), None);
-    }
-
-    #[test]
-    fn a_person_of_the_backgrounds_colour_is_kept_by_the_body() {
-        let plate = picture(wall, 1);
-        let mask = mask_from_plate(&picture(wall, 3), &plate, &gate()).unwrap().unwrap();
-        let inner = iou(&mask, |x, y| (34..56).contains(&x) && (24..76).contains(&y));
-        assert!(inner > 0.6, "{inner}");
-    }
-
-    #[test]
-    fn other_sizes_are_refused() {
-        let plate = Image::new(2, 2, PixelFormat::Rgb8, vec![0; 12]).unwrap();
-        let refused = |now: &Image, plate: &Image| mask_from_plate(now, plate, &gate()).unwrap_err().kind;
-        assert_eq!(refused(&picture(wall, 1), &plate), TrackErrorKind::Image);
-        assert_eq!(refused(&plate, &plate), TrackErrorKind::Image, "the gate is of another size");
+    /// Adds a colour of an unknown pixel; its mean counts as known once it has been steady.
+    fn learn(&mut self, at: usize, now: [f32; 3]) {
+        let run = self.steady[at];
+        let value = &mut self.values[3 * at..3 * at + 3];
+        if run == 0 || value.iter().zip(now).any(|(v, n)| (*v - n).abs() > STEADY) {
+            value.copy_from_slice(&now);
+            self.steady[at] = 1;
+        } else {
+            value.iter_mut().zip(now).for_each(|(v, n)| *v += (n - *v) / (f32::from(run) + 1.0));
+            self.steady[at] = run + 1;
+        }
     }
 }

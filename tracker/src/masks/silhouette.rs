@@ -1,27 +1,31 @@
-//! Masks without a plate: the network's coarse mask, sharpened on the image and gated by the fitted body.
+//! Masks from the network's coarse mask, sharpened on the image and gated by the fitted body.
+//!
+//! The probability is joined with a colour model of person and surroundings, evidence from the background where it is known,
+//! and the distance to the body, then smoothed along the image's edges by a guided filter (He et al. 2010).
 
 use flyrig_types::Mask;
 use glam::DVec2;
 use rayon::prelude::*;
 
-use crate::gate::BodyGate;
-use crate::grid::{Grid, clean};
-use crate::net::NET_SIDE;
-use crate::pixels::Rgb;
-use crate::plate::NO_EVIDENCE;
-use crate::sighting::Sighting;
+use crate::image::grid::{Grid, clean};
+use crate::image::pixels::Rgb;
+use crate::landmarks::sighting::Sighting;
+use crate::masks::gate::BodyGate;
+use crate::masks::plate_evidence::NO_EVIDENCE;
+use crate::network::output::NET_SIDE;
 
-/// Twice the log-odds of a pixel that surely differs from the plate, and of one that does not.
+/// Twice the log-odds of a pixel that surely differs from the plate, and of one that surely matches it.
 const DIFFERENT_LOGIT: f32 = 10.0;
 const PLATE_LOGIT: f32 = 6.0;
-/// Bins a colour channel of the colour model.
+/// Bins per channel of the colour model.
 const BINS: usize = 16;
 
-/// Distance from the body, in the gate's unit, at which a mask from the body alone ends, and over which it fades.
+/// Distance from the body at which a mask from the body alone ends, and width of its fade, in the gate's unit.
 const CLOTHES: f32 = 0.2;
 const FADE: f32 = 0.1;
 
-/// The network's probability of a person inside of the gate's bounds; one from the body alone where the network has no mask.
+/// Returns the network's probability of a person inside the gate's bounds, or one from the body alone where the network has no
+/// mask.
 pub(crate) fn coarse_mask(sighting: &Sighting, gate: &BodyGate) -> Grid {
     let [x0, y0, x1, y1] = gate.bounds;
     let Some(mask) = &sighting.output.mask else { return body_mask(gate) };
@@ -35,21 +39,18 @@ pub(crate) fn coarse_mask(sighting: &Sighting, gate: &BodyGate) -> Grid {
     coarse
 }
 
-/// The probability that the body's distance gives.
+/// Returns a probability from the distance to the body alone.
 fn body_mask(gate: &BodyGate) -> Grid {
     let mut coarse = gate.distance.clone();
     coarse.values.iter_mut().for_each(|distance| *distance = 1.0 / (1.0 + ((*distance - CLOTHES) / FADE).exp()));
     coarse
 }
 
-/// Person mask of an image from the network's coarse one inside of the gate's bounds, and the size of one of its pixels in
-/// the image's; `None` when nothing is left.
+/// Returns the person's mask at the image's size; `None` when it is empty.
 ///
-/// The network's probability is joined with a colour model of person and surroundings (histograms of this
-/// image's own sure regions) and the distance to the fitted body, then smoothed along the image's edges
-/// by a guided filter (He et al. 2010), so that the outline snaps to them.
-/// Evidence from an empty plate in the gate's bounds counts as well where there is one: it sees
-/// thin parts that the coarse mask misses, and the coarse mask sees what has the background's colour.
+/// `coarse` is the network's probability inside the gate's bounds and `crop_scale` the size of one of its pixels in pixels of
+/// the image. The colour model consists of histograms of this image's own sure regions. Evidence from the background, inside the
+/// gate's bounds, finds thin parts that the coarse mask misses, and the coarse mask finds parts of the background's colour.
 pub(crate) fn refine(
     picture: &Rgb,
     coarse: &Grid,
@@ -79,7 +80,7 @@ pub(crate) fn refine(
             }
         }
     }
-    // By bin: pixels outnumber bins.
+    // Once per bin: pixels outnumber bins.
     let speaks = inside_total > 50.0 && outside_total > 50.0;
     let color_logit = |bin: usize| {
         let (i, o) = (smooth(&inside, bin) / inside_total, smooth(&outside, bin) / outside_total);
@@ -103,7 +104,7 @@ pub(crate) fn refine(
             let near = 1.0 - 4.0 * d.min(1.0);
             let evidence = plate_evidence.map_or(NO_EVIDENCE, |e| e.values[at]) - NO_EVIDENCE;
             let plate = evidence * if evidence > 0.0 { DIFFERENT_LOGIT } else { PLATE_LOGIT };
-            // What the surroundings look like here the plate knows better: shoes of the floor's colour are no floor.
+            // The plate knows better how the surroundings look at this pixel: shoes of the floor's colour are no floor.
             let color = if evidence == 0.0 { color } else { color.max(0.0) };
             let logit = (p / (1.0 - p)).ln() + 0.6 * color + near + plate;
             *probability = 1.0 / (1.0 + (-logit).exp());
@@ -126,7 +127,7 @@ pub(crate) fn refine(
     smoothed.paste(picture.width, picture.height, x0, y0)
 }
 
-/// The bin's own count and a share of its neighbours'.
+/// Returns a bin's count and a share of its neighbours' counts.
 fn smooth(histogram: &[f32], bin: usize) -> f32 {
     let mut sum = histogram[bin];
     for (step, limit) in [(1, BINS), (BINS, BINS * BINS), (BINS * BINS, BINS * BINS * BINS)] {
@@ -141,7 +142,7 @@ fn smooth(histogram: &[f32], bin: usize) -> f32 {
     sum
 }
 
-/// Bilinear sample of the network's mask; nobody outside the crop.
+/// Samples the network's mask bilinearly at a pixel of the crop; 0 outside.
 pub(crate) fn net_probability(mask: &[f32], at: DVec2) -> f32 {
     let limit = NET_SIDE as f64 - 1.0;
     if !(at.x >= 0.0 && at.y >= 0.0 && at.x <= limit && at.y <= limit) {

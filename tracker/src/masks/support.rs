@@ -1,35 +1,36 @@
-//! Mask fragments that no other camera can support.
+//! Clears mask fragments that no other camera supports.
 //!
-//! Somebody who walks behind the person, or a screen that lights up there, differs from the plate as a sleeve does, and lies beside the
-//! body in one image only. A part of the person is in every camera that looks at its place.
+//! A passer-by behind the person, or a screen that lights up there, differs from the plate as a sleeve does, but lies beside the
+//! body in one image only. A part of the person appears in every camera that views its place: a visual hull test along the ray.
 
 use flyrig_types::{Camera, Mask};
 use glam::{DVec2, DVec3};
 use rayon::prelude::*;
 
-use crate::gate::BodyGate;
-use crate::grid::{Grid, components};
+use crate::image::grid::{Grid, components};
+use crate::masks::gate::BodyGate;
 
-/// Side of the squares that are judged as one, metres at the body, and in pixels at least.
+/// Side of the squares that are tested as one, metres at the body, and its least value in pixels.
 const SQUARE_M: f64 = 0.02;
 const MIN_SQUARE_PX: f64 = 2.0;
-/// Distance from the body, in the gate's unit, from which masks need support: an outline is the camera's own.
+/// Distance from the body beyond which masks need support, in the gate's unit: nearer, an outline is the camera's own.
 const NEEDS_SUPPORT: f32 = 0.3;
-/// Depths along a ray are tried this far apart, metres.
+/// Spacing of the depths that are tried along a ray, metres.
 const DEPTH_STEP_M: f64 = 0.03;
-/// A fragment has this many squares at least; fewer are edges on which cameras disagree by their calibration.
+/// Least number of squares of a fragment; fewer are edges on which cameras disagree by their calibration.
 const MIN_SQUARES: usize = 6;
 
-/// Of more than this many other cameras one may miss a part that the rest has.
+/// Number of other cameras above which one of them may miss a part that the rest has.
 const MAY_DISSENT: usize = 3;
 
-/// A mask in squares: which hold some of it, widened by one square for errors of calibration and time.
+/// Mask in squares: those that hold some of it, widened by one square for errors of calibration and time.
 struct Coarse {
     squares: Grid,
     side_px: usize,
 }
 
 impl Coarse {
+    /// Reduces a mask to squares of `side_px`.
     fn new(mask: &Mask, side_px: usize) -> Self {
         let (width, height) = (mask.width() as usize, mask.height() as usize);
         let mut squares = Grid::new(width.div_ceil(side_px), height.div_ceil(side_px), 0.0);
@@ -43,7 +44,7 @@ impl Coarse {
         Self { squares, side_px }
     }
 
-    /// Whether the mask may cover a pixel; `None` outside of the image.
+    /// Whether the mask may cover a pixel; `None` outside the image.
     fn may_cover(&self, pixel: DVec2) -> Option<bool> {
         let at = (pixel + 0.5) / self.side_px as f64;
         if !(at.x >= 0.0 && at.y >= 0.0) {
@@ -55,9 +56,9 @@ impl Coarse {
     }
 }
 
-/// Clears pieces of `masks` beside the body that are at no depth where clothes may hang in the masks of the other cameras that look there
-/// (all of up to three, all but one of more). Slices are by camera; a camera without a mask or a gate is not asked. The masks are of a person who
-/// is alone: another one would hide parts that a mask has to have.
+/// Clears components of `masks` beside the body that lie, at every depth that clothes may have, outside the masks of the other
+/// cameras that view the place (all of up to three, all but one of more). Slices are in rig order; cameras without a mask or a gate
+/// are ignored. The person must be alone: another one would hide parts that a mask should have.
 pub(crate) fn drop_unsupported(cameras: &[Camera], gates: &[Option<BodyGate>], masks: &mut [Option<Mask>]) {
     let side_px = |gate: &BodyGate| (SQUARE_M * gate.px_per_m).round().max(MIN_SQUARE_PX) as usize;
     let coarse: Vec<Option<Coarse>> = masks
@@ -104,7 +105,7 @@ pub(crate) fn drop_unsupported(cameras: &[Camera], gates: &[Option<BodyGate>], m
     }
 }
 
-/// The mask without pieces of several squares that are not supported; `None` where there is none of them.
+/// Returns the mask without unsupported components of several squares; `None` when there are none.
 fn without_fragments(
     mask: &Mask,
     gate: &BodyGate,
@@ -114,7 +115,7 @@ fn without_fragments(
     let [x0, y0, x1, y1] = gate.bounds;
     let width = mask.width() as usize;
     let mut doubtful = Grid::new((x1 - x0).div_ceil(side_px), (y1 - y0).div_ceil(side_px), 0.0);
-    let judged = |x: usize, y: usize| {
+    let needs_support = |x: usize, y: usize| {
         gate.distance.values[(y - y0) * gate.distance.width + x - x0] > NEEDS_SUPPORT
             && mask.coverage()[y * width + x] > 0
     };
@@ -124,7 +125,7 @@ fn without_fragments(
     };
     for row in 0..doubtful.height {
         for column in 0..doubtful.width {
-            if !square(column, row).any(|(x, y)| judged(x, y)) {
+            if !square(column, row).any(|(x, y)| needs_support(x, y)) {
                 continue;
             }
             let centre =
@@ -147,7 +148,7 @@ fn without_fragments(
     }
     let mut coverage = mask.coverage().to_vec();
     for at in fragments {
-        for (x, y) in square(at % doubtful.width, at / doubtful.width).filter(|(x, y)| judged(*x, *y)) {
+        for (x, y) in square(at % doubtful.width, at / doubtful.width).filter(|(x, y)| needs_support(*x, *y)) {
             coverage[y * width + x] = 0;
         }
     }
@@ -157,7 +158,7 @@ fn without_fragments(
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::body_model::BodyModel;
+    use crate::pose::body_model::BodyModel;
     use crate::testing::{body, mask_of, random_turns, ring};
     use flyrig_body::{Template, skin_mesh};
     use flyrig_types::{Pose, Rig};
@@ -256,7 +257,7 @@ mod tests {
     }
 
     #[test]
-    fn cameras_without_a_mask_or_a_look_at_the_place_do_not_contradict() {
+    fn cameras_without_a_mask_or_a_view_of_the_place_do_not_contradict() {
         let mut scene = scene(3);
         let at = disc(&scene.rig, 0, beside(&scene), 12.0);
         paint(&mut scene.masks[0], at);

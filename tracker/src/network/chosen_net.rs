@@ -5,12 +5,13 @@ use std::sync::Arc;
 
 use glam::DVec2;
 
-use crate::crop::Crop;
-use crate::landmark_net::{LandmarkNet, sigmoid};
-use crate::net::{CropLandmark, NetOutput};
-use crate::network_file::{Channels, NetworkFile, Number, OutputForm, Unit};
-use crate::pixels::Rgb;
-use crate::{LANDMARK_COUNT, TrackError};
+use crate::error::TrackError;
+use crate::image::crop::Crop;
+use crate::image::pixels::Rgb;
+use crate::landmarks::keypoints::LANDMARK_COUNT;
+use crate::network::landmark_net::{LandmarkNet, sigmoid};
+use crate::network::network_file::{Channels, NetworkFile, Number, OutputForm, Unit};
+use crate::network::output::{CropLandmark, NetOutput};
 
 /// Landmarks of one run: pixels of the input, centre of the first pixel at 0, and confidence; by index in the output.
 type Points = Vec<(DVec2, f64)>;

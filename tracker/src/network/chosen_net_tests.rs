@@ -5,8 +5,9 @@ use prost::Message;
 use tract_onnx::pb;
 
 use super::*;
-use crate::landmarks::LANDMARK_NAMES;
-use crate::{PoseNet, TrackErrorKind};
+use crate::error::TrackErrorKind;
+use crate::landmarks::keypoints::LANDMARK_NAMES;
+use crate::network::pose_net::PoseNet;
 
 const WIDTH: usize = 48;
 const HEIGHT: usize = 64;
@@ -163,7 +164,7 @@ fn channels_mean_and_deviation_are_those_of_the_description() {
 
 #[test]
 fn blazepose_that_is_described_sees_what_the_built_in_one_sees() {
-    let onnx = include_bytes!("../assets/pose_full.onnx");
+    let onnx = include_bytes!("../../assets/pose_full.onnx");
     let names: Vec<String> =
         LANDMARK_NAMES.iter().enumerate().map(|(index, name)| format!("\"{name}\" = {index}")).collect();
     let head = "output = \"points\"\npoint = [\"x\", \"y\", \"skip\", \"logit\", \"logit\"]";

@@ -6,9 +6,9 @@ use tract_linalg::multithread::{Executor, multithread_tract_scope};
 use tract_onnx::prelude::*;
 use tract_onnx::tract_hir::infer::Factoid as _;
 
-use crate::upsample::replace_doublings;
-use crate::vector_state::{clear_after_products, clear_upper_halves};
-use crate::{TrackError, TrackErrorKind};
+use crate::error::{TrackError, TrackErrorKind};
+use crate::network::upsample::replace_doublings;
+use crate::network::vector_state::{clear_after_products, clear_upper_halves};
 
 /// A network that takes one crop of an image.
 #[derive(Clone)]

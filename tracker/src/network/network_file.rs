@@ -5,8 +5,8 @@ use std::path::{Path, PathBuf};
 
 use serde::Deserialize;
 
-use crate::landmarks::{LANDMARK_NAMES, LEFT_HIP, LEFT_SHOULDER, RIGHT_HIP, RIGHT_SHOULDER};
-use crate::{LANDMARK_COUNT, TrackError, TrackErrorKind};
+use crate::error::{TrackError, TrackErrorKind};
+use crate::landmarks::keypoints::{LANDMARK_COUNT, LANDMARK_NAMES, LEFT_HIP, LEFT_SHOULDER, RIGHT_HIP, RIGHT_SHOULDER};
 
 /// Landmarks that a network has to give at least, beside hips and shoulders.
 const LEAST_LANDMARKS: usize = 8;

@@ -2,51 +2,20 @@
 
 use std::path::Path;
 
-use crate::chosen_net::ChosenNet;
-use crate::crop::Crop;
-use crate::landmark_net::{LandmarkNet, sigmoid};
-use crate::pixels::Rgb;
-use crate::{LANDMARK_COUNT, TrackError};
-
-/// Side of the network's image, pixels.
-pub const NET_SIDE: usize = 256;
+use crate::error::TrackError;
+use crate::image::crop::Crop;
+use crate::image::pixels::Rgb;
+use crate::landmarks::keypoints::LANDMARK_COUNT;
+use crate::network::chosen_net::ChosenNet;
+use crate::network::landmark_net::{LandmarkNet, sigmoid};
+use crate::network::output::{CropLandmark, NET_SIDE, NetOutput};
 
 /// Floats a landmark takes in the network's output.
 const LANDMARK_STRIDE: usize = 5;
 /// Landmarks the network gives: 33 of the body, 6 helpers of the original's tracking that we do not use.
 const NET_LANDMARKS: usize = 39;
 
-static EMBEDDED: &[u8] = include_bytes!("../assets/pose_full.onnx");
-
-/// A landmark inside the crop.
-#[derive(Debug, Clone, Copy, PartialEq, Default)]
-pub struct CropLandmark {
-    /// Pixels of the crop, centre of the first pixel at 0.
-    pub x: f64,
-    /// Pixels of the crop.
-    pub y: f64,
-    /// Smaller of the probabilities that the landmark is visible and that it lies in the crop.
-    pub confidence: f64,
-    /// Metres from the middle of the hips, axes of the crop: x right, y down, z away from the camera; `None` of a network that
-    /// gives no depth.
-    pub world: Option<[f64; 3]>,
-}
-
-impl CropLandmark {
-    /// A landmark that the network does not give.
-    pub(crate) const UNSEEN: Self = Self { x: f64::NAN, y: f64::NAN, confidence: 0.0, world: None };
-}
-
-/// What the network sees in one crop.
-#[derive(Debug, Clone)]
-pub struct NetOutput {
-    /// Body landmarks.
-    pub landmarks: [CropLandmark; LANDMARK_COUNT],
-    /// Probability of a person.
-    pub presence: f64,
-    /// Person probability, 256 x 256, row by row, 0..1; `None` of a network without masks.
-    pub mask: Option<Vec<f32>>,
-}
+static EMBEDDED: &[u8] = include_bytes!("../../assets/pose_full.onnx");
 
 /// A landmark network: the one built in (BlazePose full, Bazarevsky et al. 2020; licence beside the file in `assets`), or one of
 /// the user's choice.
@@ -137,7 +106,7 @@ fn run_blazepose(net: &LandmarkNet, rgb: &[f32]) -> Result<NetOutput, TrackError
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::TrackErrorKind;
+    use crate::error::TrackErrorKind;
 
     fn grey() -> Rgb<'static> {
         Rgb { width: NET_SIDE, height: NET_SIDE, bytes: vec![128; NET_SIDE * NET_SIDE * 3].into() }

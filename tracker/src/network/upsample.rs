@@ -130,7 +130,7 @@ mod tests {
 
     #[test]
     fn the_pose_networks_doublings_are_replaced() {
-        let mut bytes = &include_bytes!("../assets/pose_full.onnx")[..];
+        let mut bytes = &include_bytes!("../../assets/pose_full.onnx")[..];
         let fact = f32::fact(tvec!(1, 256, 256, 3)).into();
         let model = onnx().model_for_read(&mut bytes).and_then(|model| model.with_input_fact(0, fact)).unwrap();
         let mut model = model.into_optimized().unwrap();

@@ -63,7 +63,7 @@ mod tests {
 
     #[test]
     fn every_product_of_the_pose_network_is_followed_by_a_clearing_that_changes_nothing() {
-        let mut bytes = &include_bytes!("../assets/pose_full.onnx")[..];
+        let mut bytes = &include_bytes!("../../assets/pose_full.onnx")[..];
         let fact = f32::fact(tvec!(1, 256, 256, 3)).into();
         let model = onnx().model_for_read(&mut bytes).and_then(|model| model.with_input_fact(0, fact)).unwrap();
         let plain = model.into_optimized().unwrap();

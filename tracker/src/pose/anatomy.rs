@@ -3,7 +3,7 @@
 use flyrig_body::Skeleton;
 use glam::{DMat3, DVec3};
 
-use crate::{TrackError, TrackErrorKind};
+use crate::error::{TrackError, TrackErrorKind};
 
 /// Joints that the fit must know; sides are left, right.
 #[derive(Debug, Clone, PartialEq, Eq)]

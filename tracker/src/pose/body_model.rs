@@ -8,11 +8,11 @@ use flyrig_body::Template;
 use flyrig_types::Pose;
 use glam::{DQuat, DVec3};
 
-use crate::anatomy::{JointRange, Roles, joint_ranges};
-use crate::habits::add_habits;
-use crate::landmarks::{LEFT_HIP, LEFT_SHOULDER, RIGHT_HIP, RIGHT_SHOULDER};
-use crate::surface_marks::{Mark, find_marks};
-use crate::{LANDMARK_COUNT, TrackError, TrackErrorKind};
+use crate::error::{TrackError, TrackErrorKind};
+use crate::landmarks::bias::add_biases;
+use crate::landmarks::keypoints::{LANDMARK_COUNT, LEFT_HIP, LEFT_SHOULDER, RIGHT_HIP, RIGHT_SHOULDER};
+use crate::landmarks::surface_marks::{Mark, find_marks};
+use crate::pose::anatomy::{JointRange, Roles, joint_ranges};
 
 /// Turns of all joints and the root's place.
 #[derive(Debug, Clone, PartialEq)]
@@ -65,13 +65,13 @@ pub(crate) struct BodyModel {
 impl BodyModel {
     /// With the landmarks where the network points.
     pub fn new(template: &Template) -> Result<Self, TrackError> {
-        let mut model = Self::without_habits(template)?;
-        add_habits(template, &mut model.marks);
+        let mut model = Self::with_anatomical_marks(template)?;
+        add_biases(template, &mut model.marks);
         Ok(model)
     }
 
     /// With the landmarks at their anatomical places.
-    pub fn without_habits(template: &Template) -> Result<Self, TrackError> {
+    pub fn with_anatomical_marks(template: &Template) -> Result<Self, TrackError> {
         let joints = template.skeleton.joints();
         let roles = Roles::find(&template.skeleton, &template.name)?;
         let canonical_from_joint: Vec<_> = joints.iter().map(|joint| joint.joint_from_canonical.inverse()).collect();

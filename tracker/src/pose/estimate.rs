@@ -3,7 +3,7 @@
 use flyrig_types::{Mask, Pose};
 use glam::DVec3;
 
-use crate::{LANDMARK_COUNT, ViewKeypoints};
+use crate::landmarks::keypoints::{LANDMARK_COUNT, ViewKeypoints};
 
 /// Why a camera of a set has no mask.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]

@@ -16,31 +16,33 @@ use flyrig_types::{Camera, Frame, FrameSet, Image, Mask, Rig};
 use glam::{DVec3, Vec3};
 use rayon::prelude::*;
 
-use crate::background::Background;
-use crate::beside::beside_each_other;
-use crate::body_model::{BodyModel, Turns};
-use crate::body_shape::ShapeSpace;
-use crate::crop::Crop;
-use crate::fit::{Before, FitProblem, FitView, align_trunk};
-use crate::gate::BodyGate;
-use crate::line_point::LinePoint;
-use crate::looks::{Look, LookBody, carried_mask, corners, due};
-use crate::outline::SeenBody;
-use crate::pixels::Rgb;
-use crate::plate::gated_mask;
-use crate::search::{Search, SearchScene, project_all};
-use crate::shape::{fit_template_shape, height_m, seen_landmarks, template_of_height};
-use crate::shape_solve::{ShapeAndPoses, ShapeProblem, ShapeSet};
-use crate::sighting::Sighting;
-use crate::silhouette::{coarse_mask, refine};
-use crate::single_view::{growth_to_floor, lift};
-use crate::texture::{Brightness, LEVELS, Texture, TexturedBody};
-use crate::triangulate::{WorldPoint, triangulate};
-use crate::view::{Observation, View, observe};
-use crate::{
-    LANDMARK_COUNT, NoMask, PoseConfig, PoseEstimate, PoseNet, PoseQuality, ShapeFit, StageSeconds, TrackError,
-    TrackErrorKind, ViewKeypoints, ViewQuality,
-};
+use crate::error::{TrackError, TrackErrorKind};
+use crate::image::crop::Crop;
+use crate::image::pixels::Rgb;
+use crate::image::view::{Observation, View, observe};
+use crate::landmarks::inference_schedule::{Look, LookBody, due};
+use crate::landmarks::keypoints::{LANDMARK_COUNT, ViewKeypoints};
+use crate::landmarks::search::{Search, SearchScene, project_all};
+use crate::landmarks::sighting::Sighting;
+use crate::landmarks::single_view::{growth_to_floor, lift};
+use crate::landmarks::triangulate::{WorldPoint, triangulate};
+use crate::masks::background::Background;
+use crate::masks::carried_mask::{carried_mask, corners};
+use crate::masks::gate::BodyGate;
+use crate::masks::gated_mask::gated_mask;
+use crate::masks::silhouette::{coarse_mask, refine};
+use crate::network::parallel::beside_each_other;
+use crate::network::pose_net::PoseNet;
+use crate::pose::body_model::{BodyModel, Turns};
+use crate::pose::config::PoseConfig;
+use crate::pose::estimate::{NoMask, PoseEstimate, PoseQuality, StageSeconds, ViewQuality};
+use crate::pose::fit::{Before, FitProblem, FitView, align_trunk};
+use crate::pose::line_point::LinePoint;
+use crate::pose::outline::SeenBody;
+use crate::pose::texture::{Brightness, LEVELS, Texture, TexturedBody};
+use crate::shape::body_shape::ShapeSpace;
+use crate::shape::bone_lengths::{ShapeFit, fit_template_shape, height_m, seen_landmarks, template_of_height};
+use crate::shape::shape_solve::{ShapeAndPoses, ShapeProblem, ShapeSet};
 
 /// Usable landmarks in one view below which there is nobody to fit.
 const MIN_LANDMARKS: usize = 8;

@@ -11,11 +11,11 @@ use flyrig_solve::{
 use glam::{DMat3, DVec3};
 use nalgebra::DVector;
 
-use crate::LANDMARK_COUNT;
-use crate::body_model::{BodyModel, Posed, Turns};
-use crate::habits::{doubt, spread_m};
-use crate::line_point::{LineKind, LinePoint};
-use crate::view::{Observation, View};
+use crate::image::view::{Observation, View};
+use crate::landmarks::bias::{doubt, spread_m};
+use crate::landmarks::keypoints::LANDMARK_COUNT;
+use crate::pose::body_model::{BodyModel, Posed, Turns};
+use crate::pose::line_point::{LineKind, LinePoint};
 
 /// Weight of a landmark in the fit: the face's many points are one body, and the fingers' are vague.
 const LANDMARK_WEIGHT: [f64; LANDMARK_COUNT] = {
@@ -407,11 +407,14 @@ pub(crate) fn align_trunk(model: &BodyModel, points: &[Option<DVec3>; LANDMARK_C
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::image::view::observe;
     use crate::testing::{body, fit_problem, keypoints_of, noisy_keypoints, random_turns, ring};
-    use crate::view::observe;
     use rand::{SeedableRng, rngs::StdRng};
 
-    fn views(count: usize, keypoints: impl Fn(&flyrig_types::Camera) -> crate::ViewKeypoints) -> Vec<FitView> {
+    fn views(
+        count: usize,
+        keypoints: impl Fn(&flyrig_types::Camera) -> crate::landmarks::keypoints::ViewKeypoints,
+    ) -> Vec<FitView> {
         ring(count)
             .cameras
             .iter()

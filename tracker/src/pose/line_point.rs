@@ -6,8 +6,8 @@ use flyrig_body::Template;
 use flyrig_types::Camera;
 use glam::{DVec2, DVec3, Vec3};
 
-use crate::body_model::BodyModel;
-use crate::view::View;
+use crate::image::view::View;
+use crate::pose::body_model::BodyModel;
 
 /// Where a line comes from.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]

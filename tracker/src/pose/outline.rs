@@ -4,10 +4,10 @@ use flyrig_body::Template;
 use flyrig_types::{Camera, Mask};
 use glam::{DVec2, DVec3, Vec3};
 
-use crate::body_model::BodyModel;
-use crate::gate::drawn_body;
-use crate::line_point::{LineKind, LinePoint, bones, undistorted_line};
-use crate::view::View;
+use crate::image::view::View;
+use crate::masks::gate::drawn_body;
+use crate::pose::body_model::BodyModel;
+use crate::pose::line_point::{LineKind, LinePoint, bones, undistorted_line};
 
 /// A vertex is on the rim where the angle between its normal and the image plane has a smaller sine.
 const RIM_SINE: f64 = 0.4;
@@ -124,7 +124,7 @@ mod tests {
     use flyrig_types::Pose;
 
     use super::*;
-    use crate::body_model::Turns;
+    use crate::pose::body_model::Turns;
     use crate::testing::{body, mask_of, random_turns, ring};
 
     fn matched(camera: &Camera, mask: &Mask, template: &Template, pose: &Pose) -> Vec<LinePoint> {

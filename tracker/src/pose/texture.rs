@@ -8,11 +8,11 @@ use flyrig_body::Template;
 use flyrig_types::{Camera, Mask};
 use glam::{DVec2, DVec3, Vec3};
 
-use crate::body_model::BodyModel;
-use crate::grid::Grid;
-use crate::line_point::{LineKind, LinePoint, bones, undistorted_line};
-use crate::pixels::Rgb;
-use crate::view::View;
+use crate::image::grid::Grid;
+use crate::image::pixels::Rgb;
+use crate::image::view::View;
+use crate::pose::body_model::BodyModel;
+use crate::pose::line_point::{LineKind, LinePoint, bones, undistorted_line};
 
 /// Distance between neighbouring points on the rest surface, metres.
 const SPACING_M: f64 = 0.03;
@@ -318,10 +318,11 @@ mod tests {
     use glam::DQuat;
 
     use super::*;
-    use crate::body_model::Turns;
-    use crate::fit::FitView;
+    use crate::fit;
+    use crate::landmarks::keypoints::LANDMARK_COUNT;
+    use crate::pose::body_model::Turns;
+    use crate::pose::fit::FitView;
     use crate::testing::{body, fit_problem, random_turns, ring};
-    use crate::{LANDMARK_COUNT, fit};
 
     /// A printed body in front of a camera, drawn triangle by triangle in the order of depth.
     fn photo(camera: &Camera, view: &View, template: &Template, pose: &Pose) -> Rgb<'static> {

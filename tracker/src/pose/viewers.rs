@@ -6,7 +6,11 @@ use flyrig_body::Template;
 use flyrig_types::{Frame, FrameSet, Image, Pose, Rig};
 use rayon::prelude::*;
 
-use crate::{PoseConfig, PoseEstimate, PoseEstimator, PoseNet, TrackError, TrackErrorKind};
+use crate::error::{TrackError, TrackErrorKind};
+use crate::network::pose_net::PoseNet;
+use crate::pose::config::PoseConfig;
+use crate::pose::estimate::PoseEstimate;
+use crate::pose::estimator::PoseEstimator;
 
 /// One pose estimator per camera.
 #[derive(Debug, Clone)]

@@ -5,8 +5,8 @@ use std::collections::BTreeMap;
 use flyrig_body::{Joint, ShapeParams, Skeleton, Template, default_template};
 use glam::{DMat3, DMat4, DVec3};
 
-use crate::body_model::BodyModel;
-use crate::{TrackError, TrackErrorKind};
+use crate::error::{TrackError, TrackErrorKind};
+use crate::pose::body_model::BodyModel;
 
 /// Standard deviation of the whole-body scale among people.
 const SCALE_SIGMA: f64 = 0.15;

@@ -6,10 +6,12 @@ use flyrig_body::{Outfit, Template};
 use flyrig_solve::median;
 use flyrig_types::Rig;
 
-use crate::body_model::BodyModel;
-use crate::body_shape::{ShapeSpace, scale_template};
-use crate::triangulate::triangulate;
-use crate::{LANDMARK_COUNT, PoseConfig, TrackError, ViewKeypoints};
+use crate::error::TrackError;
+use crate::landmarks::keypoints::{LANDMARK_COUNT, ViewKeypoints};
+use crate::landmarks::triangulate::triangulate;
+use crate::pose::body_model::BodyModel;
+use crate::pose::config::PoseConfig;
+use crate::shape::body_shape::{ShapeSpace, scale_template};
 
 /// Lengths are pulled towards the template's proportions as if those were this many measurements.
 const PRIOR_COUNT: f64 = 2.0;
@@ -225,7 +227,7 @@ mod tests {
     use glam::{DMat4, DVec3};
 
     use super::*;
-    use crate::TrackErrorKind;
+    use crate::error::TrackErrorKind;
     use crate::testing::{body, keypoints_of, random_turns, ring};
 
     #[test]
@@ -274,7 +276,7 @@ mod tests {
     fn no_views_one_view_and_poison_are_lost_not_nan() {
         let template = body();
         let rig = ring(2);
-        let nan = [crate::Keypoint { pixel: glam::DVec2::NAN, confidence: 1.0 }; LANDMARK_COUNT];
+        let nan = [crate::landmarks::keypoints::Keypoint { pixel: glam::DVec2::NAN, confidence: 1.0 }; LANDMARK_COUNT];
         let points = [DVec3::new(0.0, 0.0, 1.0); LANDMARK_COUNT];
         let one_point = [0, 1].map(|i| Some(keypoints_of(&rig.cameras[i], &points))).to_vec();
         for keypoints in [vec![], vec![vec![None, None]], vec![vec![Some(nan), Some(nan)]], vec![one_point]] {

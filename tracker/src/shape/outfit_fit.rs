@@ -5,7 +5,7 @@ use flyrig_types::{Camera, Mask, Pose};
 use glam::{DVec2, Vec3};
 use rayon::prelude::*;
 
-use crate::grid::Grid;
+use crate::image::grid::Grid;
 
 /// Masks are compared in squares of this size, metres at the body: for skirts, and around the feet for shoes.
 const SQUARE_M: f64 = 0.015;
@@ -197,7 +197,7 @@ fn find_skirt(body: &Template, worn: Outfit, seen: &MaskedPoses<'_>) -> Option<S
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::body_model::BodyModel;
+    use crate::pose::body_model::BodyModel;
     use crate::testing::{body, mask_of, random_turns, ring};
 
     fn found(worn: Outfit) -> Outfit {

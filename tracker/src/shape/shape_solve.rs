@@ -6,10 +6,10 @@ use glam::DVec3;
 use nalgebra::DVector;
 use rayon::prelude::*;
 
-use crate::body_model::{BodyModel, Turns};
-use crate::body_shape::ShapeSpace;
-use crate::fit::{FitProblem, ShapeDerivatives};
-use crate::line_point::LinePoint;
+use crate::pose::body_model::{BodyModel, Turns};
+use crate::pose::fit::{FitProblem, ShapeDerivatives};
+use crate::pose::line_point::LinePoint;
+use crate::shape::body_shape::ShapeSpace;
 
 /// Step of the derivatives by the shape's parameters.
 const STEP: f64 = 0.01;
@@ -174,16 +174,22 @@ mod tests {
     use flyrig_types::Camera;
 
     use super::*;
-    use crate::fit::FitView;
-    use crate::outline::SeenBody;
+    use crate::image::view::{View, observe};
+    use crate::pose::fit::FitView;
+    use crate::pose::outline::SeenBody;
     use crate::testing::{body, fit_problem, keypoints_of, mask_of, random_turns, ring};
-    use crate::view::{View, observe};
 
     fn views(cameras: &[Camera], model: &BodyModel, turns: &Turns) -> Vec<FitView> {
         let one = |(slot, camera): (usize, &Camera)| {
             let view = View::new(camera);
             let seen = observe(camera, &view, &keypoints_of(camera, &model.marks(turns)), 0.3);
-            FitView { slot, view, seen, shift: [DVec3::ZERO; crate::LANDMARK_COUNT], delay_secs: 0.0 }
+            FitView {
+                slot,
+                view,
+                seen,
+                shift: [DVec3::ZERO; crate::landmarks::keypoints::LANDMARK_COUNT],
+                delay_secs: 0.0,
+            }
         };
         cameras.iter().enumerate().map(one).collect()
     }

@@ -1,8 +1,8 @@
 //! Masks of the person whose pose is known.
 
 use super::*;
-use crate::background::MOSTLY_KNOWN;
-use crate::support::drop_unsupported;
+use crate::masks::background_light::MOSTLY_KNOWN;
+use crate::masks::support::drop_unsupported;
 
 impl PoseEstimator {
     /// Masks by slot; why there is none goes into the views' quality.

@@ -1,9 +1,9 @@
 //! The person's shape: bone lengths from landmarks, and lengths, girths and build from outlines.
 
 use super::*;
-use crate::HeightFrom;
-use crate::line_point::BareBody;
-use crate::outfit_fit::{MaskedPoses, MaskedView, find_outfit};
+use crate::pose::line_point::BareBody;
+use crate::shape::bone_lengths::HeightFrom;
+use crate::shape::outfit_fit::{MaskedPoses, MaskedView, find_outfit};
 use flyrig_body::Shoes;
 use flyrig_types::Camera;
 

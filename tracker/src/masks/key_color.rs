@@ -1,27 +1,27 @@
-//! Masks before a screen of one colour.
+//! Masks and mattes before a screen of one colour.
 //!
 //! A screen's chroma (linear light less its mean) lies along that of the key colour, and its strength varies slowly over the
-//! image with the lamps. Coverage is what is missing of the screen's chroma; what remains of it on the foreground is spill.
+//! image with the lamps. Coverage is the missing share of the screen's chroma; chroma that remains on the foreground is spill.
 
 use std::fmt;
 use std::str::FromStr;
 
-use crate::edge_color::{EdgeColor, Matte};
-use crate::grid::Grid;
-use crate::light::{byte, linear_of_bytes};
-use crate::pixels::Rgb;
+use crate::image::grid::Grid;
+use crate::image::light::{byte, linear_of_bytes};
+use crate::image::pixels::Rgb;
+use crate::masks::edge_color::{EdgeColor, Matte};
 
-/// Cosine between the chroma of a pixel and of the key from which the pixel shows the screen.
+/// Least cosine between the chroma of a screen pixel and that of the key.
 const SCREEN_COSINE: f32 = 0.94;
-/// Least chroma of the screen over the key's: a screen in the shade.
+/// Least chroma of a screen pixel as a share of the key's: a screen in the shade.
 const LEAST_CHROMA: f32 = 0.12;
-/// Share of an image that has to show the screen for the key to be used.
+/// Share of an image that must show the screen for the key to be used.
 const LEAST_SCREEN: f32 = 0.02;
-/// Half of the side of the square in which the screen's light is averaged, pixels.
+/// Half side of the square in which the screen's light is averaged, pixels.
 const LOCAL_PX: usize = 24;
-/// A screen in a shadow keeps this share of its chroma.
+/// Least share of its chroma that a screen keeps in a shadow.
 const SHADOW: f32 = 0.35;
-/// Spill is removed up to this share of the screen's chroma: more is the foreground's own colour.
+/// Largest spill that is removed, as a share of the screen's chroma: more is the foreground's own colour.
 const SPILL: f32 = 0.3;
 
 /// Colour of a screen behind the people.
@@ -32,7 +32,7 @@ pub struct KeyColor {
     chroma: [f32; 3],
 }
 
-/// Text that names no key colour.
+/// Error of a text that names no key colour.
 #[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
 #[error("{0:?} is no key colour; use \"green\", \"blue\" or a saturated colour such as \"#00b140\"")]
 pub struct KeyColorError(String);
@@ -53,7 +53,7 @@ impl FromStr for KeyColor {
             }
         };
         let key = Self { rgb, chroma: chroma(linear_of_bytes(rgb)) };
-        // Grey has no chroma to tell it from anything.
+        // Grey has no chroma by which to separate it.
         if dot(key.chroma, key.chroma).sqrt() < 0.1 { Err(error()) } else { Ok(key) }
     }
 }
@@ -65,15 +65,15 @@ impl fmt::Display for KeyColor {
     }
 }
 
-/// The screen as an image shows it.
+/// Screen as one image shows it.
 pub(crate) struct Screen {
     /// Chroma of each pixel along the key's, over that of the screen there: 1 on the screen.
     share: Grid,
-    /// Strength of the screen's chroma along the key's, by pixel.
+    /// Strength of the screen's chroma along the key's at each pixel.
     strength: Grid,
     /// Linear light of the screen where it shines with strength 1.
     light: [f32; 3],
-    /// Whether a pixel shows the screen alone.
+    /// Whether each pixel shows the screen alone.
     is_screen: Vec<bool>,
 }
 
@@ -85,7 +85,7 @@ impl Screen {
 }
 
 impl KeyColor {
-    /// `None` when the image shows no screen of this colour.
+    /// Measures the screen in an image; `None` when it shows no screen of this colour.
     pub(crate) fn screen(&self, picture: &Rgb) -> Option<Screen> {
         let (width, height) = (picture.width, picture.height);
         let key2 = dot(self.chroma, self.chroma);
@@ -120,7 +120,7 @@ impl KeyColor {
             Grid { width, height, values }.box_mean(LOCAL_PX)
         };
         let (total, known) = (mean(&|at| along.values[at]), mean(&|_| 1.0));
-        // Far from the screen the typical strength stands in.
+        // Far from the screen the typical strength is used.
         let strengths = total.values.iter().zip(&known.values).map(|(t, n)| (t + 0.01 * typical) / (n + 0.01));
         let strength = Grid { width, height, values: strengths.collect() };
         let shares = along.values.iter().zip(&strength.values).map(|(a, s)| a / s);
@@ -129,7 +129,7 @@ impl KeyColor {
         Some(Screen { share, strength, light, is_screen })
     }
 
-    /// Returns evidence for a foreground inside of `bounds` (x0, y0, x1, y1, ends excluded), 0..=1 with the border at one half.
+    /// Returns evidence for a foreground inside `bounds` (x0, y0, x1, y1, ends excluded), 0..=1 with the border at one half.
     pub(crate) fn evidence(&self, picture: &Rgb, screen: &Screen, [x0, y0, x1, y1]: [usize; 4]) -> Grid {
         let mut evidence = Grid::new(x1 - x0, y1 - y0, 0.0);
         let key = dot(self.chroma, self.chroma).sqrt();
@@ -147,7 +147,7 @@ impl KeyColor {
         evidence
     }
 
-    /// Takes the screen's spill off the colours of a matte; leaves it as it is without a screen of this colour.
+    /// Subtracts the screen's spill from the colours of a matte; does nothing when the image shows no screen of this colour.
     pub(crate) fn despill(&self, picture: &Rgb, matte: &mut Matte) {
         let Some(screen) = self.screen(picture) else { return };
         let mut colors = Vec::new();
@@ -170,6 +170,7 @@ impl KeyColor {
     }
 }
 
+/// Returns linear light less its mean.
 fn chroma(light: [f32; 3]) -> [f32; 3] {
     let mean = (light[0] + light[1] + light[2]) / 3.0;
     light.map(|c| c - mean)
@@ -181,11 +182,12 @@ fn dot(a: [f32; 3], b: [f32; 3]) -> f32 {
 
 #[cfg(test)]
 mod tests {
-    use flyrig_types::{Camera, Image, Intrinsics, Isometry, Lens, Mask, PixelFormat};
-    use glam::DVec2;
+    use flyrig_types::{Image, Mask, PixelFormat};
 
     use super::*;
-    use crate::{Background, matte};
+    use crate::masks::background::Background;
+    use crate::masks::matte::matte;
+    use crate::testing::small_camera;
 
     const SIDE: usize = 96;
 
@@ -210,20 +212,7 @@ mod tests {
     const SHIRT: [f32; 3] = [0.35, 0.12, 0.1];
 
     fn background(key: &str) -> Background {
-        let camera = Camera {
-            time_offset_nanos: 0,
-            color: Default::default(),
-            id: "a".into(),
-            intrinsics: Intrinsics {
-                width: SIDE as u32,
-                height: SIDE as u32,
-                focal_px: DVec2::splat(90.0),
-                center_px: DVec2::splat(47.5),
-                lens: Lens::PINHOLE,
-            },
-            camera_from_world: Isometry::IDENTITY,
-        };
-        Background::from_key(&camera, key.parse().unwrap())
+        Background::from_key(&small_camera("a", SIDE), key.parse().unwrap())
     }
 
     fn scene() -> Image {
