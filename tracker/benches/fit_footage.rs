@@ -1,18 +1,18 @@
-//! Runs the tracker on an EasyMocap data set and draws what it found.
+//! Runs the tracker on an EasyMocap data set, prints residuals, mask overlap and times, and draws the result.
 //!
 //! ```text
-//! cargo run --release -p flyrig-tracker --example fit_footage -- DATASET OUT 01,02,04 [FIRST COUNT FPS DRAW_EVERY]
+//! cargo bench -p flyrig-tracker --bench fit_footage -- DATASET OUT 01,02,04 [FIRST COUNT FPS DRAW_EVERY]
 //! ```
 //!
-//! Cameras that are not named are held out: the fitted body is drawn over their images too, and compared
-//! with what the network sees there.
+//! Cameras that are not named are held out: the fitted body is drawn over their images too, and compared with the network's
+//! landmarks there. Without arguments it prints its usage.
 
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
 
 use flyrig_body::{ShapeParams, default_template, load_gltf, skin_mesh};
 use flyrig_calib::load_calibration;
-use flyrig_tracker::{LANDMARK_BONES, LANDMARK_COUNT, PoseConfig, PoseEstimate, PoseEstimator, PoseNet};
+use flyrig_tracker::{LANDMARK_COUNT, PoseConfig, PoseEstimate, PoseEstimator, PoseNet};
 use flyrig_types::{Camera, CameraId, Frame, FrameSet, Image, Mask, PixelFormat, Rig};
 use glam::{DVec2, DVec3};
 use image::imageops::FilterType;
@@ -20,10 +20,47 @@ use image::{Rgb, RgbImage};
 
 type Result<T> = std::result::Result<T, Box<dyn std::error::Error>>;
 
+/// Pairs of landmarks that are joined by a line.
+const LANDMARK_BONES: [(usize, usize); 30] = [
+    (0, 2),
+    (2, 7),
+    (0, 5),
+    (5, 8),
+    (9, 10),
+    (11, 12),
+    (11, 13),
+    (13, 15),
+    (15, 17),
+    (15, 19),
+    (15, 21),
+    (12, 14),
+    (14, 16),
+    (16, 18),
+    (16, 20),
+    (16, 22),
+    (11, 23),
+    (12, 24),
+    (23, 24),
+    (23, 25),
+    (25, 27),
+    (27, 29),
+    (29, 31),
+    (27, 31),
+    (24, 26),
+    (26, 28),
+    (28, 30),
+    (30, 32),
+    (28, 32),
+    (17, 19),
+];
+
 fn main() -> Result<()> {
-    let arguments: Vec<String> = std::env::args().skip(1).collect();
-    let [root, out, cameras] =
-        arguments.first_chunk().ok_or("usage: DATASET OUT CAMERA,CAMERA,... [FIRST COUNT FPS]")?;
+    // Cargo adds "--bench".
+    let arguments: Vec<String> = std::env::args().skip(1).filter(|argument| argument != "--bench").collect();
+    let Some([root, out, cameras]) = arguments.first_chunk() else {
+        println!("usage: DATASET OUT CAMERA,CAMERA,... [FIRST COUNT FPS DRAW_EVERY]");
+        return Ok(());
+    };
     let number = |index: usize, default: i64| arguments.get(index).map_or(Ok(default), |text| text.parse::<i64>());
     let (first, count, fps, draw_every) = (number(3, 0)?, number(4, 97)?, number(5, 60)?, number(6, 10)?);
     let (root, out) = (PathBuf::from(root), PathBuf::from(out));
@@ -158,7 +195,7 @@ fn main() -> Result<()> {
         }
     }
     let used = residuals.len().max(1) as f64;
-    println!("{} sets, {lost} lost, median reprojection {:.2} px", residuals.len(), median(&mut residuals));
+    println!("{} frame sets, {lost} lost, median reprojection {:.2} px", residuals.len(), median(&mut residuals));
     for (camera, list) in rig.cameras.iter().zip(&mut per_camera) {
         println!("  camera {}: {:.2} px", camera.id, median(list));
     }
@@ -181,7 +218,7 @@ fn main() -> Result<()> {
     }
     println!("fitted body and mask: median overlap (IoU) {:.3}", median(&mut agreement));
     let [net, triangulate, fit, masks] = seconds.map(|s| s / used * 1e3);
-    println!("ms a set: net {net:.1}, triangulate {triangulate:.2}, fit {fit:.1}, masks {masks:.1}");
+    println!("ms per frame set: net {net:.1}, triangulate {triangulate:.2}, fit {fit:.1}, masks {masks:.1}");
     Ok(())
 }
 

@@ -8,7 +8,7 @@ use rand::{RngExt, SeedableRng, rngs::StdRng};
 
 use crate::landmarks::keypoints::{Keypoint, LANDMARK_COUNT, ViewKeypoints};
 use crate::masks::gate::drawn_body;
-use crate::pose::body_model::{BodyModel, Turns};
+use crate::pose::body_model::{BodyModel, JointTurns};
 use crate::pose::fit::{FitProblem, FitView};
 
 pub(crate) fn body() -> Template {
@@ -90,7 +90,7 @@ pub(crate) fn noisy_keypoints(
 }
 
 /// A body that stands near the origin of a z-up world in a comfortable pose.
-pub(crate) fn random_turns(model: &BodyModel, seed: u64) -> Turns {
+pub(crate) fn random_turns(model: &BodyModel, seed: u64) -> JointTurns {
     let mut rng = StdRng::seed_from_u64(seed);
     let mut turns = model.bind_turns(DVec3::new(rng.random_range(-0.2..0.2), rng.random_range(-0.2..0.2), 1.0));
     for (turn, range) in turns.turns.iter_mut().zip(&model.ranges) {

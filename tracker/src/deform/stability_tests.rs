@@ -1,7 +1,7 @@
 //! Long runs and hard matrices. What takes minutes is ignored by default: `make test-long`.
 
+use super::tests::{Goals, body, goals, tracker, true_displacement, wide};
 use super::*;
-use crate::deform::tests::{Goals, body, goals, tracker, true_displacement, wide};
 use glam::{DMat3, DQuat};
 use std::convert::Infallible;
 

@@ -7,7 +7,7 @@ use glam::{DVec2, DVec3};
 use crate::hands::hand_net::HAND_LANDMARKS;
 use crate::image::crop::Crop;
 use crate::image::view::View;
-use crate::pose::body_model::{BodyModel, Posed};
+use crate::pose::body_model::{BodyModel, PosedSkeleton};
 
 /// A look says nothing any more after this long, seconds.
 pub(crate) const FORGET_SECS: f64 = 0.4;
@@ -30,7 +30,7 @@ const FACING: f64 = 0.2;
 
 /// A network's landmarks of a hand or a face in one view.
 #[derive(Debug, Clone)]
-pub(crate) struct PartLook {
+pub(crate) struct PartInference {
     pub nanos: i64,
     /// Pixels from the principal point, without distortion; `None` where a landmark cannot be used.
     pub seen: Vec<Option<DVec2>>,
@@ -39,7 +39,7 @@ pub(crate) struct PartLook {
     pub frame: RigidMotion,
 }
 
-impl PartLook {
+impl PartInference {
     /// How much a new look is needed, metres.
     pub fn staleness_m(&self, frame: &RigidMotion, reach_m: f64, nanos: i64) -> f64 {
         let turned = self.frame.rotation.angle_between(frame.rotation) * reach_m;
@@ -100,7 +100,7 @@ pub(crate) struct FaceTarget {
 
 impl FaceTarget {
     /// The face of a posed body; `None` where it looks away from the camera or is out of the image.
-    pub fn new(camera: &Camera, model: &BodyModel, posed: &Posed, scale: f64) -> Option<Self> {
+    pub fn new(camera: &Camera, model: &BodyModel, posed: &PosedSkeleton, scale: f64) -> Option<Self> {
         const EYES: [usize; 2] = [2, 5];
         const MOUTH: [usize; 2] = [9, 10];
         let view = View::new(camera);
@@ -147,16 +147,16 @@ mod tests {
     }
 
     #[test]
-    fn looks_grow_stale_with_motion_and_age_and_are_carried_along() {
+    fn inferences_grow_stale_with_motion_and_age_and_are_carried_along() {
         let frame = RigidMotion { rotation: DQuat::from_rotation_x(0.3), translation: DVec3::new(0.2, 0.1, 1.0) };
-        let look = PartLook { nanos: 0, seen: Vec::new(), presence: 0.9, frame };
-        assert!(look.staleness_m(&frame, 0.1, 0).abs() < 1e-6);
+        let inference = PartInference { nanos: 0, seen: Vec::new(), presence: 0.9, frame };
+        assert!(inference.staleness_m(&frame, 0.1, 0).abs() < 1e-6);
         let moved = RigidMotion { translation: frame.translation + DVec3::X * 0.03, ..frame };
-        assert!(look.staleness_m(&moved, 0.1, 0) > 0.029);
-        assert!(look.staleness_m(&frame, 0.1, 1_000_000_000) > 0.04);
-        assert!(look.trust(0) > 0.89 && look.trust(120_000_000) < 0.46);
+        assert!(inference.staleness_m(&moved, 0.1, 0) > 0.029);
+        assert!(inference.staleness_m(&frame, 0.1, 1_000_000_000) > 0.04);
+        assert!(inference.trust(0) > 0.89 && inference.trust(120_000_000) < 0.46);
         let point = DVec3::new(0.25, 0.0, 1.1);
-        let then = look.carry(&moved).apply(point);
+        let then = inference.carry(&moved).apply(point);
         assert!((then - (point - DVec3::X * 0.03)).length() < 1e-9);
     }
 }

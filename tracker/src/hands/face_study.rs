@@ -6,7 +6,7 @@ use glam::{DMat3, DVec3};
 
 use crate::error::TrackError;
 use crate::hands::crop_schedule::FaceTarget;
-use crate::hands::face_net::{FaceNet, FaceOutput};
+use crate::hands::face_net::{FACE_SIDE, FaceNet, FaceOutput};
 use crate::hands::face_points::RIGID;
 use crate::image::pixels::Rgb;
 use crate::image::view::View;
@@ -57,7 +57,7 @@ impl FaceStudy {
         let posed = model.pose(&turns);
         let scale = template_scale(template);
         let Some(target) = FaceTarget::new(camera, &model, &posed, scale) else { return Ok(false) };
-        let side = super::FACE_SIDE;
+        let side = FACE_SIDE;
         let FaceOutput { landmarks, presence } = self.net.run(&target.crop.sample_square(&Rgb::new(image)?, side))?;
         if presence < 0.5 {
             return Ok(false);

@@ -14,13 +14,12 @@ use nalgebra::DVector;
 
 use crate::hands::hand_model::{Bends, BentHand, HandModel, moving, range, relaxed};
 use crate::hands::hand_net::HAND_LANDMARKS;
-use crate::image::view::View;
+use crate::hands::sight::Sight;
 
 /// Unknowns: shift, turn, four angles of five fingers.
 const SIZE: usize = 26;
-/// Standard deviation of a landmark, metres and pixels of the image.
+/// Standard deviation of a landmark, metres.
 const SPREAD_M: f64 = 0.006;
-const SPREAD_PX: f64 = 1.0;
 /// Residuals of this many standard deviations lose half their weight.
 const ROBUST: f64 = 2.0;
 /// Standard deviations of the body's wrist: place in metres, turn in radians.
@@ -37,13 +36,9 @@ const MAX_STEPS: usize = 30;
 /// The landmarks of one view.
 #[derive(Debug, Clone)]
 pub(crate) struct HandSight {
-    pub view: View,
-    /// Pixels from the principal point, without distortion.
+    pub sight: Sight,
+    /// Undistorted pixels from the principal point.
     pub seen: [Option<DVec2>; HAND_LANDMARKS],
-    /// Importance, 0..=1.
-    pub trust: f64,
-    /// From the world at the set's time to where the hand was in this image, as far as the wrist moved it.
-    pub carry: RigidMotion,
 }
 
 /// A hand relative to the body's pose.
@@ -94,14 +89,13 @@ impl HandProblem<'_> {
     }
 
     /// Median distance of a view's landmarks, standard deviations and pixels; `None` without any.
-    pub fn residual(&self, at: &HandPose, sight: &HandSight) -> Option<(f64, f64)> {
+    pub fn residual(&self, at: &HandPose, hand: &HandSight) -> Option<(f64, f64)> {
         let (points, _) = self.points(at);
         let (mut sigmas, mut pixels) = (Vec::new(), Vec::new());
-        for (point, seen) in points.iter().zip(&sight.seen) {
-            let moved = sight.carry.apply(*point);
-            let (Some(seen), Some(pixel)) = (seen, sight.view.project(moved)) else { continue };
+        for (point, seen) in points.iter().zip(&hand.seen) {
+            let (Some(seen), Some(pixel)) = (seen, hand.sight.project(*point)) else { continue };
             let distance = pixel.distance(*seen);
-            sigmas.push(distance / spread_px(sight, self.wrist.translation)?);
+            sigmas.push(distance / hand.sight.spread_px(self.wrist.translation, SPREAD_M)?);
             pixels.push(distance);
         }
         Some((flyrig_solve::median(&mut sigmas)?, flyrig_solve::median(&mut pixels)?))
@@ -137,25 +131,17 @@ impl HandProblem<'_> {
     fn sight_terms(&self, at: &HandPose, mut each: impl FnMut(usize, DVec3, [DVec3; 2], DVec2, f64, f64)) {
         let (points, _) = self.points(at);
         let kernel = Kernel::Cauchy(ROBUST);
-        for sight in self.sights {
-            let Some(spread) = spread_px(sight, self.wrist.translation) else { continue };
-            let back = sight.carry.rotation.inverse();
-            for (index, (point, seen)) in points.iter().zip(&sight.seen).enumerate() {
+        for HandSight { sight, seen } in self.sights {
+            let Some(spread) = sight.spread_px(self.wrist.translation, SPREAD_M) else { continue };
+            for (index, (point, seen)) in points.iter().zip(seen).enumerate() {
                 let Some(seen) = seen else { continue };
-                let Some((pixel, rows)) = sight.view.project_with_derivative(sight.carry.apply(*point)) else {
-                    continue;
-                };
+                let Some((pixel, rows)) = sight.project_with_derivative(*point) else { continue };
                 let error = (pixel - *seen) / spread;
                 let (cost, weight) = kernel.weigh(error.length_squared(), sight.trust);
-                each(index, *point, rows.map(|row| back * row / spread), error, weight, cost);
+                each(index, *point, rows.map(|row| row / spread), error, weight, cost);
             }
         }
     }
-}
-
-/// Standard deviation of a landmark in a view, pixels; `None` behind the camera.
-fn spread_px(sight: &HandSight, wrist: DVec3) -> Option<f64> {
-    Some((SPREAD_M * sight.view.px_per_m(wrist)?).hypot(SPREAD_PX))
 }
 
 impl Problem for HandProblem<'_> {
@@ -228,6 +214,7 @@ impl Problem for HandProblem<'_> {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::image::view::View;
     use crate::testing::{body, ring};
     use rand::{RngExt, SeedableRng, rngs::StdRng};
 
@@ -258,7 +245,7 @@ mod tests {
             let view = View::new(camera);
             let carry = if slot == 1 { carry } else { RigidMotion::IDENTITY };
             let seen = points.map(|point| view.project(carry.apply(point)));
-            HandSight { view, seen, trust: 1.0, carry }
+            HandSight { sight: Sight { view, trust: 1.0, carry }, seen }
         };
         ring(count).cameras.iter().enumerate().map(sight).collect()
     }

@@ -9,13 +9,12 @@ use flyrig_solve::{
 use glam::{DQuat, DVec2, DVec3};
 use nalgebra::DVector;
 
-use crate::image::view::View;
+use crate::hands::sight::Sight;
 
 /// Unknowns: shift, turn, logarithm of the size.
 const SIZE: usize = 7;
-/// Standard deviation of a landmark, metres and pixels of the image.
+/// Standard deviation of a landmark, metres.
 const SPREAD_M: f64 = 0.005;
-const SPREAD_PX: f64 = 1.0;
 /// Residuals of this many standard deviations lose half their weight.
 const ROBUST: f64 = 2.0;
 /// Standard deviations of the body's head: place in metres, turn in radians; of the size, logarithm.
@@ -30,14 +29,9 @@ const MAX_STEPS: usize = 20;
 /// The face in one view.
 #[derive(Debug, Clone)]
 pub(crate) struct FaceSight {
-    pub view: View,
-    /// Pixels from the principal point, without distortion, and the place on the head: canonical axes from the head's joint,
-    /// metres.
+    pub sight: Sight,
+    /// Undistorted pixels from the principal point, and the place on the head: canonical axes from the head's joint, metres.
     pub seen: Vec<(DVec2, DVec3)>,
-    /// Importance, 0..=1.
-    pub trust: f64,
-    /// From the world at the set's time to where the head was in this image, as far as its joint moved it.
-    pub carry: RigidMotion,
 }
 
 /// A head relative to the body's pose.
@@ -79,12 +73,11 @@ impl HeadProblem<'_> {
     }
 
     /// Median distance of a view's landmarks, standard deviations and pixels; `None` without any.
-    pub fn residual(&self, at: &HeadPose, sight: &FaceSight) -> Option<(f64, f64)> {
-        let spread = spread_px(sight, self.head.translation)?;
-        let distance = |(seen, point): &(DVec2, DVec3)| {
-            Some(sight.view.project(sight.carry.apply(self.place(at, *point)))?.distance(*seen))
-        };
-        let mut pixels: Vec<f64> = sight.seen.iter().filter_map(distance).collect();
+    pub fn residual(&self, at: &HeadPose, face: &FaceSight) -> Option<(f64, f64)> {
+        let spread = face.sight.spread_px(self.head.translation, SPREAD_M)?;
+        let distance =
+            |(seen, point): &(DVec2, DVec3)| Some(face.sight.project(self.place(at, *point))?.distance(*seen));
+        let mut pixels: Vec<f64> = face.seen.iter().filter_map(distance).collect();
         let median = flyrig_solve::median(&mut pixels)?;
         Some((median / spread, median))
     }
@@ -92,25 +85,18 @@ impl HeadProblem<'_> {
     /// Calls `each` with every landmark's world place, the rows of derivatives by it, residuals, weight and cost.
     fn sight_terms(&self, at: &HeadPose, mut each: impl FnMut(DVec3, [DVec3; 2], DVec2, f64, f64)) {
         let kernel = Kernel::Cauchy(ROBUST);
-        for sight in self.sights {
-            let Some(spread) = spread_px(sight, self.head.translation) else { continue };
-            let back = sight.carry.rotation.inverse();
-            let importance = sight.trust * (COUNT / sight.seen.len() as f64).min(1.0);
-            for (seen, point) in &sight.seen {
+        for FaceSight { sight, seen } in self.sights {
+            let Some(spread) = sight.spread_px(self.head.translation, SPREAD_M) else { continue };
+            let importance = sight.trust * (COUNT / seen.len() as f64).min(1.0);
+            for (seen, point) in seen {
                 let place = self.place(at, *point);
-                let Some((pixel, rows)) = sight.view.project_with_derivative(sight.carry.apply(place)) else {
-                    continue;
-                };
+                let Some((pixel, rows)) = sight.project_with_derivative(place) else { continue };
                 let error = (pixel - *seen) / spread;
                 let (cost, weight) = kernel.weigh(error.length_squared(), importance);
-                each(place, rows.map(|row| back * row / spread), error, weight, cost);
+                each(place, rows.map(|row| row / spread), error, weight, cost);
             }
         }
     }
-}
-
-fn spread_px(sight: &FaceSight, head: DVec3) -> Option<f64> {
-    Some((SPREAD_M * sight.view.px_per_m(head)?).hypot(SPREAD_PX))
 }
 
 impl Problem for HeadProblem<'_> {
@@ -169,6 +155,7 @@ impl Problem for HeadProblem<'_> {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::image::view::View;
     use crate::testing::ring;
 
     fn head() -> RigidMotion {
@@ -193,7 +180,7 @@ mod tests {
             let view = View::new(camera);
             let seen = (0..30).filter_map(|k| Some((view.project(problem.place(&truth(), point(k)))?, point(k))));
             let seen: Vec<_> = seen.collect();
-            FaceSight { view, seen, trust: 1.0, carry: RigidMotion::IDENTITY }
+            FaceSight { sight: Sight { view, trust: 1.0, carry: RigidMotion::IDENTITY }, seen }
         };
         ring(count).cameras.iter().map(sight).collect()
     }

@@ -13,4 +13,5 @@ mod hand_model;
 pub(crate) mod hand_net;
 mod head_fit;
 pub(crate) mod quality;
+mod sight;
 pub(crate) mod tracker;

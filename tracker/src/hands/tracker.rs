@@ -9,7 +9,7 @@ use glam::{DQuat, DVec3};
 use rayon::prelude::*;
 
 use crate::error::{TrackError, TrackErrorKind};
-use crate::hands::crop_schedule::{FORGET_SECS, FaceTarget, PartLook, hand_crop};
+use crate::hands::crop_schedule::{FORGET_SECS, FaceTarget, PartInference, hand_crop};
 use crate::hands::face_net::{FACE_SIDE, FaceNet};
 use crate::hands::face_points::FACE_POINTS;
 use crate::hands::hand_fit::{HandPose, HandProblem, HandSight};
@@ -17,12 +17,12 @@ use crate::hands::hand_model::{Bends, HandModel, relaxed};
 use crate::hands::hand_net::{HAND_LANDMARKS, HAND_SIDE, HandNet};
 use crate::hands::head_fit::{FaceSight, HeadProblem};
 use crate::hands::quality::{HandQuality, HandState, HandsQuality, HeadQuality};
+use crate::hands::sight::Sight;
 use crate::image::crop::Crop;
 use crate::image::pixels::Rgb;
 use crate::image::view::View;
 use crate::landmarks::bias::template_scale;
-use crate::pose::body_model::{BodyModel, Posed};
-use crate::pose::estimator::check_size;
+use crate::pose::body_model::{BodyModel, PosedSkeleton};
 
 /// Presence from which a network's landmarks are believed.
 const MIN_PRESENCE: f64 = 0.5;
@@ -45,7 +45,7 @@ pub struct HandConfig {
     pub min_face_px: f64,
     /// Crops that the networks look at in a set, hands and faces together; 0 for all that are due.
     pub crops: usize,
-    /// Motion of a hand or head in metres, or of their flesh through a turn, until a view of it gets a new look. Looks
+    /// Motion of a hand or head in metres, or of their flesh through a turn, until a view of it gets a new inference. Looks
     /// grow old by themselves.
     pub look_after_m: f64,
     /// Whether fingers are estimated.
@@ -72,7 +72,7 @@ pub struct HandTracker {
     hands: [HandModel; 2],
     scale: f64,
     /// By part, then slot.
-    looks: [Vec<Option<PartLook>>; PARTS],
+    inferences: [Vec<Option<PartInference>>; PARTS],
     last: Option<Last>,
 }
 
@@ -90,7 +90,7 @@ struct Candidate {
     part: usize,
     slot: usize,
     crop: Crop,
-    /// See [`PartLook::staleness_m`]; infinite without a look.
+    /// See [`PartInference::staleness_m`]; infinite without a inference.
     staleness_m: f64,
 }
 
@@ -129,7 +129,7 @@ impl HandTracker {
             body,
             hands,
             template,
-            looks: std::array::from_fn(|_| vec![None; slots]),
+            inferences: std::array::from_fn(|_| vec![None; slots]),
             last: None,
         })
     }
@@ -162,7 +162,10 @@ impl HandTracker {
     pub fn move_camera(&mut self, slot: usize, camera: &Camera) {
         if let Some(known) = self.rig.cameras.get_mut(slot) {
             known.clone_from(camera);
-            self.looks.iter_mut().filter_map(|looks| looks.get_mut(slot)).for_each(|look| *look = None);
+            self.inferences
+                .iter_mut()
+                .filter_map(|inferences| inferences.get_mut(slot))
+                .for_each(|inference| *inference = None);
         }
     }
 
@@ -178,7 +181,7 @@ impl HandTracker {
 
     /// Forgets what was seen: the person was lost.
     pub fn reset(&mut self) {
-        self.looks.iter_mut().flatten().for_each(|look| *look = None);
+        self.inferences.iter_mut().flatten().for_each(|inference| *inference = None);
         self.last = None;
     }
 
@@ -220,13 +223,13 @@ impl HandTracker {
             .take()
             .filter(|last| (0.0..FORGET_SECS).contains(&(1e-9 * nanos.saturating_sub(last.nanos) as f64)));
         if last.is_none() {
-            self.looks.iter_mut().flatten().for_each(|look| *look = None);
+            self.inferences.iter_mut().flatten().for_each(|inference| *inference = None);
         }
         let velocity = velocities(last.as_ref(), &frames, nanos);
 
         let start = Instant::now();
         let (candidates, largest_px) = self.candidates(set, &posed, &frames, last.as_ref());
-        let crops = self.look(set, candidates, &frames, &velocity)?;
+        let crops = self.infer(set, candidates, &frames, &velocity)?;
         let net_secs = start.elapsed().as_secs_f64();
 
         let start = Instant::now();
@@ -271,7 +274,7 @@ impl HandTracker {
         pose
     }
 
-    fn frames(&self, posed: &Posed) -> [RigidMotion; PARTS] {
+    fn frames(&self, posed: &PosedSkeleton) -> [RigidMotion; PARTS] {
         [self.hands[0].hand, self.hands[1].hand, self.body.roles.head]
             .map(|joint| RigidMotion { rotation: posed.rotation[joint], translation: posed.origin[joint] })
     }
@@ -280,7 +283,7 @@ impl HandTracker {
     fn candidates(
         &self,
         set: &FrameSet,
-        posed: &Posed,
+        posed: &PosedSkeleton,
         frames: &[RigidMotion; PARTS],
         last: Option<&Last>,
     ) -> (Vec<Candidate>, [f64; 2]) {
@@ -290,9 +293,9 @@ impl HandTracker {
             let camera = &self.rig.cameras[slot];
             let view = View::new(camera);
             let mut offer = |part: usize, crop: Crop, reach_m: f64| {
-                let look = self.looks[part][slot].as_ref();
-                let staleness_m =
-                    look.map_or(f64::INFINITY, |look| look.staleness_m(&frames[part], reach_m, set.master_nanos));
+                let inference = self.inferences[part][slot].as_ref();
+                let staleness_m = inference
+                    .map_or(f64::INFINITY, |inference| inference.staleness_m(&frames[part], reach_m, set.master_nanos));
                 found.push(Candidate { part, slot, crop, staleness_m });
             };
             for (side, model) in self.hands.iter().enumerate().filter(|_| self.config.fingers) {
@@ -319,7 +322,7 @@ impl HandTracker {
     }
 
     /// Lets the networks look at the crops that need it most, within the budget. Returns the numbers of hands and faces.
-    fn look(
+    fn infer(
         &mut self,
         set: &FrameSet,
         mut candidates: Vec<Candidate>,
@@ -331,15 +334,14 @@ impl HandTracker {
         if self.config.crops > 0 {
             candidates.truncate(self.config.crops);
         }
-        let seen: Vec<(usize, usize, PartLook)> = candidates
+        let seen: Vec<(usize, usize, PartInference)> = candidates
             .par_iter()
             .map(|&Candidate { part, slot, crop, .. }| {
                 let camera = &self.rig.cameras[slot];
                 let frame = set.frames[slot].as_ref().ok_or_else(|| {
                     TrackError::new(TrackErrorKind::Frames, format!("camera {} has no frame", camera.id))
                 })?;
-                check_size(camera, &frame.image)?;
-                let picture = Rgb::new(&frame.image)?;
+                let picture = Rgb::of_camera(&frame.image, camera)?;
                 let view = View::new(camera);
                 let (seen, presence) = if part == HEAD {
                     let output = self.face_net.run(&crop.sample_square(&picture, FACE_SIDE))?;
@@ -355,23 +357,24 @@ impl HandTracker {
                 let delay_secs = 1e-9 * frame.capture_nanos.saturating_sub(set.master_nanos) as f64;
                 let translation = frames[part].translation + velocity[part] * delay_secs.clamp(-0.1, 0.1);
                 let frame = RigidMotion { translation, ..frames[part] };
-                Ok((part, slot, PartLook { nanos: set.master_nanos, seen, presence, frame }))
+                Ok((part, slot, PartInference { nanos: set.master_nanos, seen, presence, frame }))
             })
             .collect::<Result<_, TrackError>>()?;
         let mut crops = [0; 2];
-        for (part, slot, look) in seen {
+        for (part, slot, inference) in seen {
             crops[usize::from(part == HEAD)] += 1;
-            self.looks[part][slot] = Some(look);
+            self.inferences[part][slot] = Some(inference);
         }
         Ok(crops)
     }
 
     /// Looks of a part that may be used at a time.
-    fn usable(&self, part: usize, nanos: i64) -> impl Iterator<Item = (&Camera, &PartLook)> {
-        let looks = self.looks[part].iter().zip(&self.rig.cameras);
-        looks.filter_map(move |(look, camera)| {
-            let look = look.as_ref()?;
-            (look.presence >= MIN_PRESENCE && look.age_secs(nanos) < FORGET_SECS).then_some((camera, look))
+    fn usable(&self, part: usize, nanos: i64) -> impl Iterator<Item = (&Camera, &PartInference)> {
+        let inferences = self.inferences[part].iter().zip(&self.rig.cameras);
+        inferences.filter_map(move |(inference, camera)| {
+            let inference = inference.as_ref()?;
+            (inference.presence >= MIN_PRESENCE && inference.age_secs(nanos) < FORGET_SECS)
+                .then_some((camera, inference))
         })
     }
 
@@ -388,9 +391,9 @@ impl HandTracker {
             return None;
         }
         quality.state = HandState::NotSeen;
-        let sight = |(camera, look): (&Camera, &PartLook)| {
-            let seen = std::array::from_fn(|i| look.seen.get(i).copied().flatten());
-            HandSight { view: View::new(camera), seen, trust: look.trust(nanos), carry: look.carry(frame) }
+        let sight = |(camera, inference): (&Camera, &PartInference)| {
+            let seen = std::array::from_fn(|i| inference.seen.get(i).copied().flatten());
+            HandSight { sight: sight_of(camera, inference, frame, nanos), seen }
         };
         let mut sights: Vec<HandSight> = self.usable(side, nanos).map(sight).collect();
         if sights.is_empty() {
@@ -428,10 +431,10 @@ impl HandTracker {
 
     /// Fits the head to the looks at the face; `None` leaves it as it is.
     fn fit_head(&self, frame: &RigidMotion, nanos: i64, quality: &mut HeadQuality) -> Option<DQuat> {
-        let sight = |(camera, look): (&Camera, &PartLook)| {
+        let sight = |(camera, inference): (&Camera, &PartInference)| {
             let points = FACE_POINTS.iter().map(|point| point.place_m(self.scale));
-            let seen = look.seen.iter().zip(points).filter_map(|(seen, point)| Some(((*seen)?, point))).collect();
-            FaceSight { view: View::new(camera), seen, trust: look.trust(nanos), carry: look.carry(frame) }
+            let seen = inference.seen.iter().zip(points).filter_map(|(seen, point)| Some(((*seen)?, point))).collect();
+            FaceSight { sight: sight_of(camera, inference, frame, nanos), seen }
         };
         let mut sights: Vec<FaceSight> =
             self.usable(HEAD, nanos).map(sight).filter(|sight| !sight.seen.is_empty()).collect();
@@ -455,6 +458,11 @@ impl HandTracker {
         quality.turned_rad = pose.turn.angle_between(DQuat::IDENTITY);
         Some(pose.turn)
     }
+}
+
+/// Returns the view of a part in the image of an inference.
+fn sight_of(camera: &Camera, inference: &PartInference, frame: &RigidMotion, nanos: i64) -> Sight {
+    Sight { view: View::new(camera), trust: inference.trust(nanos), carry: inference.carry(frame) }
 }
 
 /// The template with fingers.
@@ -537,7 +545,7 @@ mod tests {
             let (_, quality) = tracker.estimate(&grey_set(&rig, k * 1_000_000), &pose).unwrap();
             assert_eq!(quality.crops, [2, 0]);
         }
-        assert!(tracker.looks[..2].iter().flatten().all(Option::is_some));
+        assert!(tracker.inferences[..2].iter().flatten().all(Option::is_some));
         // Nothing has moved, and no look is old.
         let (_, quality) = tracker.estimate(&grey_set(&rig, 4_000_000), &pose).unwrap();
         assert_eq!(quality.crops, [0, 0]);

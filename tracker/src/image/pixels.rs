@@ -2,7 +2,7 @@
 
 use std::borrow::Cow;
 
-use flyrig_types::{Image, PixelFormat};
+use flyrig_types::{Camera, Image, PixelFormat};
 use glam::DVec2;
 
 use crate::error::{TrackError, TrackErrorKind};
@@ -30,6 +30,26 @@ impl<'a> Rgb<'a> {
                 })?)
             };
         Ok(Self { width: image.width() as usize, height: image.height() as usize, bytes })
+    }
+
+    /// Reads an image of a camera.
+    ///
+    /// # Errors
+    /// Kind `Image` names the camera when the size is not that of its calibration, or when the format cannot be read.
+    pub fn of_camera(image: &'a Image, camera: &Camera) -> Result<Self, TrackError> {
+        let (width, height) = (camera.intrinsics.width, camera.intrinsics.height);
+        if (image.width(), image.height()) == (width, height) {
+            return Self::new(image);
+        }
+        Err(TrackError::new(
+            TrackErrorKind::Image,
+            format!(
+                "camera {}: the image is {}x{} but its calibration is for {width}x{height}",
+                camera.id,
+                image.width(),
+                image.height()
+            ),
+        ))
     }
 
     /// Whether the image is uniform except for noise, as with a covered lens.

@@ -4,7 +4,7 @@ use flyrig_body::Template;
 use glam::DVec3;
 
 use crate::landmarks::keypoints::{LANDMARK_COUNT, NOSE};
-use crate::landmarks::surface_marks::Mark;
+use crate::landmarks::surface_marks::BodyMark;
 
 /// A landmark of the left side or the middle; the right side is its mirror image.
 struct Measured {
@@ -50,7 +50,7 @@ pub(crate) fn doubt(confidence: f64) -> f64 {
 }
 
 /// Moves the landmarks from their anatomical places to where the network points.
-pub(crate) fn add_biases(template: &Template, marks: &mut [Mark; LANDMARK_COUNT]) {
+pub(crate) fn add_biases(template: &Template, marks: &mut [BodyMark; LANDMARK_COUNT]) {
     let metres = 1e-3 * template_scale(template);
     for (landmark, mark) in marks.iter_mut().enumerate() {
         let Some(Measured { bias_mm: [x, y, z], .. }) = measured(landmark) else { continue };

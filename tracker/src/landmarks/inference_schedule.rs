@@ -1,58 +1,55 @@
-//! Looks of the network at each view, and when the next one is due.
+//! Schedule of the pose network: its last inference in each view, and when the next one is due.
 //!
-//! A look stays good while the body hardly moves: its landmarks and its mask are carried along with the body. The network is
-//! the dearest part of an estimate, so a view gets a new look only once the body has moved in it.
+//! The network is the most expensive part of an estimate. An inference stays valid while the body hardly moves: its landmarks
+//! and its mask are carried along with the body ([`carried_mask`](crate::masks::carried_mask)). A view is due once the body has
+//! moved in it by more than [`PoseConfig::look_after_m`](crate::PoseConfig::look_after_m), or with age.
 
 use std::sync::Arc;
 
-use flyrig_types::Camera;
-use glam::{DVec2, DVec3, Vec3};
+use glam::DVec3;
 
-use crate::image::crop::Crop;
-use crate::image::grid::Grid;
 use crate::landmarks::keypoints::LANDMARK_COUNT;
 use crate::landmarks::sighting::Sighting;
-use crate::masks::silhouette::net_probability;
-use crate::pose::body_model::Turns;
+use crate::pose::body_model::JointTurns;
 
-/// A look grows old by this much a second, metres, so that a person who is gone is noticed.
+/// Staleness that an inference gains with age, metres per second, so that the absence of a person is noticed.
 const AGING_M_PER_SEC: f64 = 0.1;
-/// All views that need a look by more than this factor get it at once, the others in turn.
+/// Multiple of the limit beyond which all stale views are due at once; below, they are in turn.
 const URGENT: f64 = 3.0;
-/// A landmark that the body has carried this far counts half, metres.
+/// Distance over which a landmark was carried at which its confidence is halved, metres.
 const CARRIED_M: f64 = 0.05;
 
-/// The network's view of the person in one camera.
+/// Last inference of the network in one view.
 #[derive(Debug, Clone)]
-pub(crate) struct Look {
+pub(crate) struct Inference {
     pub sighting: Arc<Sighting>,
-    /// The body as it was estimated then; `None` while it is being estimated.
-    pub body: Option<LookBody>,
+    /// Body as it was estimated then; `None` while it is being estimated.
+    pub body: Option<InferredBody>,
 }
 
-/// The body at the time of a look.
+/// Body at the time of an inference.
 #[derive(Debug, Clone)]
-pub(crate) struct LookBody {
+pub(crate) struct InferredBody {
     pub nanos: i64,
-    pub turns: Arc<Turns>,
+    pub turns: Arc<JointTurns>,
     pub marks: [DVec3; LANDMARK_COUNT],
 }
 
-impl Look {
-    /// A look at the set that is being estimated.
+impl Inference {
+    /// Returns an inference in the frame set that is being estimated.
     pub fn fresh(sighting: Sighting) -> Self {
         Self { sighting: Arc::new(sighting), body: None }
     }
 
-    /// How far the body's landmarks have moved since, metres, with the share of age; 0 for a fresh look.
+    /// Returns the largest motion of the body's landmarks since, metres, plus the share of age; 0 for a fresh inference.
     fn staleness_m(&self, marks: &[DVec3; LANDMARK_COUNT], nanos: i64) -> f64 {
         let Some(body) = &self.body else { return 0.0 };
         let moved = marks.iter().zip(&body.marks).map(|(now, then)| now.distance(*then)).fold(0.0, f64::max);
         moved + AGING_M_PER_SEC * 1e-9 * nanos.saturating_sub(body.nanos).max(0) as f64
     }
 
-    /// Where each landmark was at the look less where it was at the last set, metres, and the factor of its confidence. An old
-    /// look says nothing of what has moved since the last set: a predicted motion that counted as seen would feed itself.
+    /// Returns each landmark's displacement from the last frame set to the inference, metres, and the factor of its confidence. An old
+    /// inference does not observe motion since the last frame set: a predicted motion that counted as seen would feed itself.
     pub fn carried(
         &self,
         last: &[DVec3; LANDMARK_COUNT],
@@ -66,29 +63,29 @@ impl Look {
     }
 }
 
-/// Chooses the views that the network looks at again: all that have no look, all in which the body has moved far, and of
-/// those in which it has moved by more than `limit_m` the one that waits most. Views without an image get none. Of those
-/// that have a look no more than `most` are chosen.
+/// Chooses the views in which the network runs again: all without an inference, all in which the body has moved far, and the
+/// stalest of those in which it has moved by more than `limit_m` metres. Views without an image are never due. At most `most`
+/// views that have an inference are chosen, the stalest first.
 pub(crate) fn due(
-    looks: &[Option<Look>],
+    inferences: &[Option<Inference>],
     has_image: impl Fn(usize) -> bool,
     marks: &[DVec3; LANDMARK_COUNT],
     nanos: i64,
     limit_m: f64,
     most: usize,
 ) -> Vec<bool> {
-    let staleness: Vec<f64> = looks
+    let staleness: Vec<f64> = inferences
         .iter()
         .enumerate()
-        .map(|(slot, look)| match look {
+        .map(|(slot, inference)| match inference {
             _ if !has_image(slot) => f64::NEG_INFINITY,
             None => f64::INFINITY,
-            Some(look) => look.staleness_m(marks, nanos),
+            Some(inference) => inference.staleness_m(marks, nanos),
         })
         .collect();
     let stalest = staleness.iter().copied().fold(f64::NEG_INFINITY, f64::max);
     let mut due: Vec<bool> = staleness.iter().map(|&s| s > URGENT * limit_m || (s > limit_m && s >= stalest)).collect();
-    let mut order: Vec<usize> = (0..due.len()).filter(|&slot| due[slot] && looks[slot].is_some()).collect();
+    let mut order: Vec<usize> = (0..due.len()).filter(|&slot| due[slot] && inferences[slot].is_some()).collect();
     order.sort_by(|&a, &b| staleness[b].total_cmp(&staleness[a]));
     order.into_iter().skip(most).for_each(|slot| due[slot] = false);
     due

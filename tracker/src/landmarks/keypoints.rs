@@ -42,40 +42,6 @@ pub const LANDMARK_NAMES: [&str; LANDMARK_COUNT] = [
     "right toes",
 ];
 
-/// Pairs of landmarks that are joined by a line when a person is drawn.
-pub const LANDMARK_BONES: [(usize, usize); 30] = [
-    (0, 2),
-    (2, 7),
-    (0, 5),
-    (5, 8),
-    (9, 10),
-    (11, 12),
-    (11, 13),
-    (13, 15),
-    (15, 17),
-    (15, 19),
-    (15, 21),
-    (12, 14),
-    (14, 16),
-    (16, 18),
-    (16, 20),
-    (16, 22),
-    (11, 23),
-    (12, 24),
-    (23, 24),
-    (23, 25),
-    (25, 27),
-    (27, 29),
-    (29, 31),
-    (27, 31),
-    (24, 26),
-    (26, 28),
-    (28, 30),
-    (30, 32),
-    (28, 32),
-    (17, 19),
-];
-
 /// One landmark in one image.
 #[derive(Debug, Clone, Copy, PartialEq, Default)]
 pub struct Keypoint {

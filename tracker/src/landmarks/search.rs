@@ -74,7 +74,7 @@ impl Search {
         self.views
             .par_iter_mut()
             .enumerate()
-            .map(|(slot, view)| view.look(scene, slot))
+            .map(|(slot, view)| view.search(scene, slot))
             .collect::<Result<Vec<()>, _>>()?;
         self.ask_other_views(scene)?;
         let found: Vec<Vec<Sighting>> =
@@ -83,10 +83,10 @@ impl Search {
         let agreed = choice.iter().flatten().count() > 1;
         // Nobody can disagree with a single camera.
         let is_alone = scene.pictures.iter().flatten().count() == 1;
-        let looked = |view: &ViewSearch| view.swept || (is_alone && !view.found.is_empty());
-        let looked_everywhere =
-            self.views.iter().zip(scene.pictures).all(|(view, picture)| looked(view) || picture.is_none());
-        if !agreed && !looked_everywhere {
+        let searched = |view: &ViewSearch| view.swept || (is_alone && !view.found.is_empty());
+        let searched_everywhere =
+            self.views.iter().zip(scene.pictures).all(|(view, picture)| searched(view) || picture.is_none());
+        if !agreed && !searched_everywhere {
             return Ok(vec![None; found.len()]);
         }
         if agreed || choice.iter().any(Option::is_some) {
@@ -104,7 +104,7 @@ impl Search {
         let Some(points) = lift(&scene.cameras[slot], sighting, scene.config.confidence_threshold, 1.0) else {
             return Ok(());
         };
-        let look = |(other, view): (usize, &mut ViewSearch)| -> Result<(), TrackError> {
+        let ask = |(other, view): (usize, &mut ViewSearch)| -> Result<(), TrackError> {
             let Some(picture) = scene.pictures[other].as_ref().filter(|_| view.found.is_empty()) else { return Ok(()) };
             let pixels = points.map(|point| point.and_then(|point| scene.cameras[other].project(point)));
             match Crop::around(&pixels) {
@@ -115,14 +115,14 @@ impl Search {
                 None => Ok(()),
             }
         };
-        self.views.par_iter_mut().enumerate().map(look).collect::<Result<Vec<()>, _>>()?;
+        self.views.par_iter_mut().enumerate().map(ask).collect::<Result<Vec<()>, _>>()?;
         Ok(())
     }
 }
 
 impl ViewSearch {
     /// Looks at this view's foreground and at its next crops.
-    fn look(&mut self, scene: &SearchScene<'_>, slot: usize) -> Result<(), TrackError> {
+    fn search(&mut self, scene: &SearchScene<'_>, slot: usize) -> Result<(), TrackError> {
         self.found.retain(|(_, nanos)| scene.nanos.saturating_sub(*nanos).abs() <= FORGET_NANOS);
         let Some(picture) = &scene.pictures[slot] else { return Ok(()) };
         let taken: Vec<_> = scene.taken.iter().map(|marks| project_all(&scene.cameras[slot], marks)).collect();
@@ -159,13 +159,13 @@ impl ViewSearch {
         taken: &[[Option<DVec2>; LANDMARK_COUNT]],
         nanos: i64,
     ) -> Result<(), TrackError> {
-        let mut sighting = Sighting::take(net, picture, crop)?;
+        let mut sighting = Sighting::infer(net, picture, crop)?;
         if sighting.output.presence < 0.5 * config.presence_threshold {
             return Ok(());
         }
         for _ in 0..2 {
             let Some(crop) = sighting.next_crop() else { break };
-            sighting = Sighting::take(net, picture, crop)?;
+            sighting = Sighting::infer(net, picture, crop)?;
         }
         if sighting.output.presence < config.presence_threshold || taken.iter().any(|marks| sighting.shows(marks)) {
             return Ok(());

@@ -18,8 +18,8 @@ pub(crate) struct Sighting {
 }
 
 impl Sighting {
-    pub fn take(net: &PoseNet, picture: &Rgb, crop: Crop) -> Result<Self, TrackError> {
-        let output = net.look(picture, crop)?;
+    pub fn infer(net: &PoseNet, picture: &Rgb, crop: Crop) -> Result<Self, TrackError> {
+        let output = net.infer(picture, crop)?;
         let keypoints = crop.keypoints(&output);
         Ok(Self { crop, output, keypoints })
     }

@@ -97,3 +97,59 @@ fn spread(motion: &mut [DVec2], count: &mut [f64], columns: usize, rows: usize) 
         }
     }
 }
+
+#[cfg(test)]
+mod tests {
+    use flyrig_body::skin_mesh;
+    use glam::DVec3;
+
+    use super::*;
+    use crate::network::output::NET_SIDE;
+    use crate::pose::body_model::{BodyModel, JointTurns};
+    use crate::testing::{body, mask_of, random_turns, ring};
+
+    /// Mask of a network that sees a person on the coverage of an image.
+    fn network_mask(crop: Crop, coverage: impl Fn(DVec2) -> f32) -> Vec<f32> {
+        let pixels = (0..NET_SIDE).flat_map(|y| (0..NET_SIDE).map(move |x| DVec2::new(x as f64, y as f64)));
+        pixels.map(|pixel| coverage(crop.to_image(pixel))).collect()
+    }
+
+    #[test]
+    fn a_mask_is_carried_to_where_the_body_went() {
+        let (template, camera) = (body(), ring(3).cameras[0].clone());
+        let model = BodyModel::new(&template).unwrap();
+        let turns = random_turns(&model, 5);
+        let mut moved = turns.clone();
+        moved.root += DVec3::new(0.12, 0.08, 0.0);
+        let place = |turns: &JointTurns| corners(&camera, &skin_mesh(&template, &model.to_pose(turns)).0);
+        let mask = |turns: &JointTurns| mask_of(&camera, &template, &model.to_pose(turns));
+        let (before, after) = (mask(&turns), mask(&moved));
+        let (width, height) = (before.width() as usize, before.height() as usize);
+        let crop = Crop::upright(DVec2::new(width as f64, height as f64) * 0.5, width as f64);
+        let seen = network_mask(crop, |at| {
+            let (x, y) = (at.x.round().max(0.0) as usize, at.y.round().max(0.0) as usize);
+            if x < width && y < height { f32::from(before.coverage()[y * width + x]) / 255.0 } else { 0.0 }
+        });
+        let carried = carried_mask(&seen, crop, &place(&turns), &place(&moved), [0, 0, width, height]);
+        let overlap = |mask: &flyrig_types::Mask| {
+            let pairs = carried.values.iter().zip(mask.coverage()).map(|(a, b)| (*a > 0.5, *b > 127));
+            let (both, either) =
+                pairs.fold((0, 0), |(both, either), (a, b)| (both + i32::from(a && b), either + i32::from(a || b)));
+            f64::from(both) / f64::from(either)
+        };
+        assert!(overlap(&after) > 0.93, "{} of the mask of the moved body", overlap(&after));
+        assert!(overlap(&before) < 0.8, "{} of the old one", overlap(&before));
+    }
+
+    #[test]
+    fn nothing_is_carried_of_a_body_out_of_view_and_poison_stays_out() {
+        let crop = Crop::upright(DVec2::splat(16.0), 32.0);
+        let seen = network_mask(crop, |_| 1.0);
+        for corner in [None, Some((DVec2::NAN, f64::NAN)), Some((DVec2::splat(1e9), 1.0))] {
+            let body = vec![corner; 5];
+            let carried = carried_mask(&seen, crop, &body, &body, [0, 0, 8, 8]);
+            assert!(carried.values.iter().all(|value| value.is_finite() && (0.0..=1.0).contains(value)));
+        }
+        assert!(carried_mask(&seen, crop, &Vec::new(), &Vec::new(), [3, 3, 3, 3]).values.is_empty());
+    }
+}

@@ -30,7 +30,7 @@ fn person(x: usize, y: usize) -> bool {
 }
 
 /// Mask of an image from an image of the empty scene and the body.
-fn mask(now: &Image, plate: &Image, gate: &BodyGate) -> Option<Mask> {
+fn mask_of(now: &Image, plate: &Image, gate: &BodyGate) -> Option<Mask> {
     Background::from_plate(&small_camera("a", SIDE), plate).unwrap().mask(now, gate).unwrap()
 }
 
@@ -74,7 +74,7 @@ fn the_person_is_found_and_neither_the_shadow_nor_things_far_from_the_body() {
         },
         2,
     );
-    let mask = mask(&now, &plate, &gate()).unwrap();
+    let mask = mask_of(&now, &plate, &gate()).unwrap();
     assert!(iou(&mask, person) > 0.93, "{}", iou(&mask, person));
 }
 
@@ -83,12 +83,12 @@ fn a_skirt_that_hangs_on_the_body_is_kept_where_most_clothes_end() {
     let plate = picture(wall, 1);
     let skirt = |x: usize, y: usize| person(x, y) || (40..80).contains(&y) && x < 60 + (y - 40) * 3 / 4 && x >= 30;
     let now = picture(|x, y| if skirt(x, y) { [60.0, 60.0, 150.0] } else { wall(x, y) }, 2);
-    let mask = mask(&now, &plate, &gate()).unwrap();
+    let mask = mask_of(&now, &plate, &gate()).unwrap();
     // 22 pixels from the body are 22 cm; the reach ends at 32.
     assert!(mask.coverage()[78 * SIDE + 78] >= 128);
     assert!(iou(&mask, skirt) > 0.93, "{}", iou(&mask, skirt));
     // Without a skirt it is another object.
-    let mask = mask(&now, &plate, &gate().of_known_clothes()).unwrap();
+    let mask = mask_of(&now, &plate, &gate().of_known_clothes()).unwrap();
     assert_eq!(mask.coverage()[78 * SIDE + 79], 0);
     assert!(mask.coverage()[70 * SIDE + 62] >= 128);
 }
@@ -97,7 +97,7 @@ fn a_skirt_that_hangs_on_the_body_is_kept_where_most_clothes_end() {
 fn an_empty_scene_has_no_mask_off_the_body_even_when_the_exposure_drifts() {
     let plate = picture(wall, 1);
     let off_body = BodyGate::of_grid(&body(|x, y| x == 48 && y == 48), 60.0);
-    let found = |now: &Image, plate: &Image| mask(now, plate, &off_body);
+    let found = |now: &Image, plate: &Image| mask_of(now, plate, &off_body);
     assert_eq!(found(&picture(wall, 3), &plate), None);
     let brighter = picture(|x, y| wall(x, y).map(|c| c * 1.15), 4);
     assert_eq!(found(&brighter, &plate), None);
@@ -110,7 +110,7 @@ fn an_empty_scene_has_no_mask_off_the_body_even_when_the_exposure_drifts() {
 #[test]
 fn a_person_of_the_backgrounds_colour_is_kept_by_the_body() {
     let plate = picture(wall, 1);
-    let mask = mask(&picture(wall, 3), &plate, &gate()).unwrap();
+    let mask = mask_of(&picture(wall, 3), &plate, &gate()).unwrap();
     let inner = iou(&mask, |x, y| (34..56).contains(&x) && (24..76).contains(&y));
     assert!(inner > 0.6, "{inner}");
 }

@@ -10,7 +10,7 @@ use crate::image::crop::Crop;
 use crate::image::pixels::Rgb;
 use crate::landmarks::keypoints::LANDMARK_COUNT;
 use crate::network::landmark_net::{LandmarkNet, sigmoid};
-use crate::network::network_file::{Channels, NetworkFile, Number, OutputForm, Unit};
+use crate::network::network_file::{Channels, NetworkFile, OutputForm, PointValue, Unit};
 use crate::network::output::{CropLandmark, NetOutput};
 
 /// Landmarks of one run: pixels of the input, centre of the first pixel at 0, and confidence; by index in the output.
@@ -59,7 +59,7 @@ impl ChosenNet {
     ///
     /// # Errors
     /// Kind [`crate::TrackErrorKind::Net`] when the network fails, or an output is missing or not finite.
-    pub fn look(&self, picture: &Rgb, crop: Crop) -> Result<NetOutput, TrackError> {
+    pub fn infer(&self, picture: &Rgb, crop: Crop) -> Result<NetOutput, TrackError> {
         let [width, height] = self.size;
         let (long, short) = (width.max(height), width.min(height));
         let wide = Crop { side: crop.side * long as f64 / short as f64, ..crop };
@@ -173,11 +173,11 @@ fn points(outputs: &[Array<'_>], count: usize, file: &NetworkFile, [width, heigh
         let (mut at, mut confidence) = (DVec2::ZERO, 1.0f64);
         for (value, number) in numbers.iter().map(|value| f64::from(*value)).zip(&file.point) {
             match number {
-                Number::X => at.x = value,
-                Number::Y => at.y = value,
-                Number::Confidence => confidence = confidence.min(value),
-                Number::Logit => confidence = confidence.min(sigmoid(value)),
-                Number::Skip => {}
+                PointValue::X => at.x = value,
+                PointValue::Y => at.y = value,
+                PointValue::Confidence => confidence = confidence.min(value),
+                PointValue::Logit => confidence = confidence.min(sigmoid(value)),
+                PointValue::Skip => {}
             }
         }
         (at * scale - 0.5, confidence)

@@ -117,7 +117,7 @@ fn crop() -> Crop {
 
 /// Distance of the landmarks of shoulders and hip from the spots, pixels.
 fn errors(net: &ChosenNet) -> [f64; 3] {
-    let output = net.look(&picture(), crop()).unwrap();
+    let output = net.infer(&picture(), crop()).unwrap();
     assert!(output.mask.is_none() && (0.8..=1.0).contains(&output.presence), "{}", output.presence);
     assert!(output.landmarks[0].x.is_nan() && output.landmarks[0].confidence <= 0.0, "the nose is not given");
     let keypoints = crop().keypoints(&output);
@@ -152,7 +152,7 @@ fn channels_mean_and_deviation_are_those_of_the_description() {
     let bgr = SPOTS.replace("= 2", "= 9").replace("= 0", "= 2").replace("= 9", "= 0");
     let head = "output = \"simcc\"\nchannels = \"bgr\"\nmean = [10, 20, 30]\ndeviation = [50, 50, 50]\ncertain = 5";
     let net = ChosenNet::new(described(head, &bgr), &simcc).unwrap();
-    let output = net.look(&picture(), crop()).unwrap();
+    let output = net.infer(&picture(), crop()).unwrap();
     let keypoints = crop().keypoints(&output);
     for (landmark, place, mean) in [(11, PLACES[0], 30.0), (12, PLACES[1], 20.0), (23, PLACES[2], 10.0)] {
         let seen = keypoints[landmark];
@@ -170,7 +170,7 @@ fn blazepose_that_is_described_sees_what_the_built_in_one_sees() {
     let head = "output = \"points\"\npoint = [\"x\", \"y\", \"skip\", \"logit\", \"logit\"]";
     let chosen = ChosenNet::new(described(head, &names.join("\n")), onnx).unwrap();
     let built_in = PoseNet::embedded().unwrap();
-    let [seen, expected] = [chosen.look(&picture(), crop()).unwrap(), built_in.look(&picture(), crop()).unwrap()];
+    let [seen, expected] = [chosen.infer(&picture(), crop()).unwrap(), built_in.infer(&picture(), crop()).unwrap()];
     for (seen, expected) in seen.landmarks.iter().zip(&expected.landmarks) {
         assert!((seen.x - expected.x).abs() < 0.02 && (seen.y - expected.y).abs() < 0.02, "{seen:?} {expected:?}");
         assert!((seen.confidence - expected.confidence).abs() < 1e-3);
@@ -209,7 +209,7 @@ fn a_network_that_does_not_fit_its_description_is_named_with_what_it_has() {
 fn numbers_that_are_not_finite_are_refused() {
     let net = heatmap_onnx(&[1, 3, HEIGHT as i64, WIDTH as i64]);
     let net = ChosenNet::new(described("output = \"heatmaps\"\ndeviation = [1e-38, 1, 1]", SPOTS), &net).unwrap();
-    assert_eq!(net.look(&picture(), crop()).unwrap_err().kind, TrackErrorKind::Net);
+    assert_eq!(net.infer(&picture(), crop()).unwrap_err().kind, TrackErrorKind::Net);
 }
 
 #[test]

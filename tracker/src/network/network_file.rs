@@ -36,7 +36,7 @@ pub(crate) struct NetworkFile {
     pub output: OutputForm,
     /// Meaning of each number of a landmark, where the output holds points.
     #[serde(default = "xy_confidence")]
-    pub point: Vec<Number>,
+    pub point: Vec<PointValue>,
     /// Unit of those points.
     #[serde(default)]
     pub unit: Unit,
@@ -71,7 +71,7 @@ pub(crate) enum OutputForm {
 /// A number of a point.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Deserialize)]
 #[serde(rename_all = "lowercase")]
-pub(crate) enum Number {
+pub(crate) enum PointValue {
     X,
     Y,
     /// 0..=1.
@@ -97,8 +97,8 @@ fn bytes() -> [f32; 3] {
     [255.0; 3]
 }
 
-fn xy_confidence() -> Vec<Number> {
-    vec![Number::X, Number::Y, Number::Confidence]
+fn xy_confidence() -> Vec<PointValue> {
+    vec![PointValue::X, PointValue::Y, PointValue::Confidence]
 }
 
 fn one() -> f64 {
@@ -149,7 +149,7 @@ impl NetworkFile {
             return Err(format!("certain is {}, expected a number above 0", self.certain));
         }
         let has = |number| self.point.iter().filter(|own| **own == number).count() == 1;
-        if !(has(Number::X) && has(Number::Y)) {
+        if !(has(PointValue::X) && has(PointValue::Y)) {
             return Err(
                 "point needs \"x\" and \"y\" once each, beside \"confidence\", \"logit\" or \"skip\"".to_owned()
             );

@@ -73,10 +73,10 @@ impl PoseNet {
     ///
     /// # Errors
     /// Kind [`crate::TrackErrorKind::Net`] when the network fails, or an output is missing or not finite.
-    pub(crate) fn look(&self, picture: &Rgb, crop: Crop) -> Result<NetOutput, TrackError> {
+    pub(crate) fn infer(&self, picture: &Rgb, crop: Crop) -> Result<NetOutput, TrackError> {
         match &self.kind {
             Kind::BlazePose(net) => run_blazepose(net, &crop.sample(picture)),
-            Kind::Chosen(net) => net.look(picture, crop),
+            Kind::Chosen(net) => net.infer(picture, crop),
         }
     }
 }
@@ -119,7 +119,7 @@ mod tests {
     #[test]
     fn the_embedded_network_sees_nobody_in_grey_and_refuses_a_wrong_size() {
         let net = PoseNet::embedded().unwrap();
-        let output = net.look(&grey(), whole()).unwrap();
+        let output = net.infer(&grey(), whole()).unwrap();
         assert!(output.presence < 0.5, "presence {}", output.presence);
         let mask = output.mask.unwrap();
         assert_eq!(mask.len(), NET_SIDE * NET_SIDE);
@@ -132,7 +132,7 @@ mod tests {
     fn runs_from_many_threads_and_from_rayons_own_do_not_meet() {
         use rayon::prelude::*;
         let net = PoseNet::embedded().unwrap();
-        let run = |_| net.look(&grey(), whole()).unwrap().presence.to_bits();
+        let run = |_| net.infer(&grey(), whole()).unwrap().presence.to_bits();
         let expected = run(0);
         std::thread::scope(|scope| {
             for thread in 0..4 {

@@ -11,18 +11,18 @@ use glam::{DQuat, DVec3};
 use crate::error::{TrackError, TrackErrorKind};
 use crate::landmarks::bias::add_biases;
 use crate::landmarks::keypoints::{LANDMARK_COUNT, LEFT_HIP, LEFT_SHOULDER, RIGHT_HIP, RIGHT_SHOULDER};
-use crate::landmarks::surface_marks::{Mark, find_marks};
+use crate::landmarks::surface_marks::{BodyMark, find_marks};
 use crate::pose::anatomy::{JointRange, Roles, joint_ranges};
 
-/// Turns of all joints and the root's place.
+/// JointTurns of all joints and the root's place.
 #[derive(Debug, Clone, PartialEq)]
-pub(crate) struct Turns {
+pub(crate) struct JointTurns {
     pub root: DVec3,
     /// `A_j`; for the root `G_root`.
     pub turns: Vec<DQuat>,
 }
 
-impl Turns {
+impl JointTurns {
     /// Continues the motion from `before` to here by a share of it.
     pub fn advanced(&self, before: &Self, share: f64) -> Self {
         let turn = |(now, before): (&DQuat, &DQuat)| {
@@ -40,7 +40,7 @@ impl Turns {
 
 /// World state of a skeleton.
 #[derive(Debug, Clone)]
-pub(crate) struct Posed {
+pub(crate) struct PosedSkeleton {
     /// `G_j`.
     pub rotation: Vec<DQuat>,
     /// Joint origins.
@@ -59,7 +59,7 @@ pub(crate) struct BodyModel {
     pub offsets: Vec<DVec3>,
     pub roles: Roles,
     pub ranges: Vec<Option<JointRange>>,
-    pub marks: [Mark; LANDMARK_COUNT],
+    pub marks: [BodyMark; LANDMARK_COUNT],
 }
 
 impl BodyModel {
@@ -100,13 +100,13 @@ impl BodyModel {
     }
 
     /// The bind pose with the root joint at a place.
-    pub fn bind_turns(&self, root: DVec3) -> Turns {
-        Turns { root, turns: vec![DQuat::IDENTITY; self.parents.len()] }
+    pub fn bind_turns(&self, root: DVec3) -> JointTurns {
+        JointTurns { root, turns: vec![DQuat::IDENTITY; self.parents.len()] }
     }
 
     /// Forward kinematics.
-    pub fn pose(&self, turns: &Turns) -> Posed {
-        let mut posed = Posed { rotation: Vec::with_capacity(self.parents.len()), origin: Vec::new() };
+    pub fn pose(&self, turns: &JointTurns) -> PosedSkeleton {
+        let mut posed = PosedSkeleton { rotation: Vec::with_capacity(self.parents.len()), origin: Vec::new() };
         for (joint, parent) in self.parents.iter().enumerate() {
             let (rotation, origin) = match *parent {
                 None => (turns.turns[joint], turns.root),
@@ -122,19 +122,19 @@ impl BodyModel {
     }
 
     /// World position of a mark.
-    pub fn mark(&self, posed: &Posed, landmark: usize) -> DVec3 {
+    pub fn mark(&self, posed: &PosedSkeleton, landmark: usize) -> DVec3 {
         let mark = &self.marks[landmark];
         posed.origin[mark.joint] + posed.rotation[mark.joint] * (mark.point - self.origins[mark.joint])
     }
 
     /// World positions of all marks.
-    pub fn marks(&self, turns: &Turns) -> [DVec3; LANDMARK_COUNT] {
+    pub fn marks(&self, turns: &JointTurns) -> [DVec3; LANDMARK_COUNT] {
         let posed = self.pose(turns);
         std::array::from_fn(|i| self.mark(&posed, i))
     }
 
     /// As the workspace's pose.
-    pub fn to_pose(&self, turns: &Turns) -> Pose {
+    pub fn to_pose(&self, turns: &JointTurns) -> Pose {
         let rotations = self.parents.iter().enumerate().map(|(joint, parent)| {
             let bind = self.bind_rotation[joint];
             match *parent {
@@ -147,7 +147,7 @@ impl BodyModel {
     }
 
     /// From the workspace's pose; `None` when it does not fit the skeleton or is not finite.
-    pub fn to_turns(&self, pose: &Pose) -> Option<Turns> {
+    pub fn to_turns(&self, pose: &Pose) -> Option<JointTurns> {
         if !pose.is_valid() || pose.joint_rotations.len() != self.parents.len() {
             return None;
         }
@@ -160,7 +160,7 @@ impl BodyModel {
             }
             .normalize()
         });
-        Some(Turns { root: pose.root_translation, turns: turns.collect() })
+        Some(JointTurns { root: pose.root_translation, turns: turns.collect() })
     }
 
     /// Middle of the hips to middle of the shoulders, metres.

@@ -34,7 +34,7 @@ pub struct PoseConfig {
     /// every set.
     pub look_after_m: f64,
     /// Views with an earlier look that the network looks at again in a set at most, those that need it most; 0: all that need it.
-    pub looks: usize,
+    pub max_inferences: usize,
     /// Largest number of solver steps a frame set.
     pub max_steps: usize,
     /// Whether masks are made; off saves time where the source brings its own.
@@ -59,7 +59,7 @@ impl Default for PoseConfig {
             shape_rounds: 2,
             smooth_rad: 0.15,
             look_after_m: 0.02,
-            looks: 0,
+            max_inferences: 0,
             max_steps: 12,
             masks: true,
             search_crops: 3,

@@ -63,7 +63,7 @@ pub struct PoseQuality {
     /// Landmarks that two or more views agreed on.
     pub triangulated: usize,
     /// Views that the network looked at; the others' landmarks and masks were carried along.
-    pub looked: usize,
+    pub inferred: usize,
     /// Where the time went.
     pub seconds: StageSeconds,
 }

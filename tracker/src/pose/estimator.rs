@@ -20,7 +20,7 @@ use crate::error::{TrackError, TrackErrorKind};
 use crate::image::crop::Crop;
 use crate::image::pixels::Rgb;
 use crate::image::view::{Observation, View, observe};
-use crate::landmarks::inference_schedule::{Look, LookBody, due};
+use crate::landmarks::inference_schedule::{Inference, InferredBody, due};
 use crate::landmarks::keypoints::{LANDMARK_COUNT, ViewKeypoints};
 use crate::landmarks::search::{Search, SearchScene, project_all};
 use crate::landmarks::sighting::Sighting;
@@ -33,7 +33,7 @@ use crate::masks::gated_mask::gated_mask;
 use crate::masks::silhouette::{coarse_mask, refine};
 use crate::network::parallel::beside_each_other;
 use crate::network::pose_net::PoseNet;
-use crate::pose::body_model::{BodyModel, Turns};
+use crate::pose::body_model::{BodyModel, JointTurns};
 use crate::pose::config::PoseConfig;
 use crate::pose::estimate::{NoMask, PoseEstimate, PoseQuality, StageSeconds, ViewQuality};
 use crate::pose::fit::{Before, FitProblem, FitView, align_trunk};
@@ -63,13 +63,13 @@ pub type Marks = [DVec3; LANDMARK_COUNT];
 /// The person as last seen.
 #[derive(Debug, Clone)]
 struct Track {
-    turns: Turns,
+    turns: JointTurns,
     nanos: i64,
     marks: [DVec3; LANDMARK_COUNT],
     /// Metres a second; `None` of a person who was seen at one instant only.
     velocity: Option<[DVec3; LANDMARK_COUNT]>,
     /// By slot.
-    looks: Vec<Option<Look>>,
+    inferences: Vec<Option<Inference>>,
     texture: Texture,
 }
 
@@ -105,8 +105,8 @@ pub struct PoseEstimator {
     search: Search,
     /// Sets since the person was last seen.
     lost: u32,
-    /// Whether the network looks at every view of every set.
-    looks_at_all: bool,
+    /// Whether the network inferences at every view of every set.
+    infers_always: bool,
     /// Whether sightings are kept, and the last one.
     keeps_sightings: bool,
     clothes: Clothes,
@@ -118,7 +118,7 @@ pub struct PoseEstimator {
 /// Clothes of the person.
 #[derive(Debug, Clone)]
 enum Clothes {
-    /// Nobody has looked yet.
+    /// Nobody has inferred yet.
     Unknown,
     /// The body as it is dressed.
     Known(Arc<Template>),
@@ -127,8 +127,8 @@ enum Clothes {
 /// A fitted pose before it is believed.
 #[derive(Debug, Clone)]
 struct Fitted {
-    turns: Turns,
-    looks: Vec<Option<Look>>,
+    turns: JointTurns,
+    inferences: Vec<Option<Inference>>,
     keypoints: Vec<Option<ViewKeypoints>>,
     points: [Option<WorldPoint>; LANDMARK_COUNT],
     views: Vec<ViewQuality>,
@@ -148,9 +148,9 @@ struct Evidence {
 }
 
 impl Fitted {
-    /// Views that the network looked at in this set.
-    fn looked(&self) -> usize {
-        self.looks.iter().flatten().filter(|look| look.body.is_none()).count()
+    /// Views that the network inferred at in this set.
+    fn inferred(&self) -> usize {
+        self.inferences.iter().flatten().filter(|inference| inference.body.is_none()).count()
     }
 
     /// Time of a slot's frame less the set's, seconds.
@@ -197,7 +197,7 @@ impl PoseEstimator {
             track: None,
             search: Search::default(),
             lost: 0,
-            looks_at_all: false,
+            infers_always: false,
             keeps_sightings: false,
             clothes: Clothes::Unknown,
             is_alone: true,
@@ -205,14 +205,14 @@ impl PoseEstimator {
         })
     }
 
-    /// Lets the network look at every view of every set, whether the body moves or not.
-    pub(crate) fn look_at_all(&mut self, always: bool) {
-        self.looks_at_all = always;
+    /// Lets the network inference at every view of every set, whether the body moves or not.
+    pub(crate) fn infer_always(&mut self, always: bool) {
+        self.infers_always = always;
     }
 
-    /// Keeps each set's sighting for [`Self::measure_shape`]; the network looks at every view of every set then.
+    /// Keeps each set's sighting for [`Self::measure_shape`]; the network inferences at every view of every set then.
     pub fn keep_sightings(&mut self, keep: bool) {
-        (self.looks_at_all, self.keeps_sightings, self.sighting) = (keep, keep, None);
+        (self.infers_always, self.keeps_sightings, self.sighting) = (keep, keep, None);
     }
 
     /// Returns the sighting of the last set that was estimated; `None` where there was nobody, or where none is kept.
@@ -263,8 +263,8 @@ impl PoseEstimator {
     pub fn move_camera(&mut self, slot: usize, camera: &Camera) {
         if let Some(known) = self.rig.cameras.get_mut(slot) {
             known.clone_from(camera);
-            let look = self.track.as_mut().and_then(|track| track.looks.get_mut(slot));
-            look.into_iter().for_each(|look| *look = None);
+            let inference = self.track.as_mut().and_then(|track| track.inferences.get_mut(slot));
+            inference.into_iter().for_each(|inference| *inference = None);
         }
     }
 
@@ -281,14 +281,14 @@ impl PoseEstimator {
         true
     }
 
-    fn start_at(&mut self, turns: Turns, nanos: i64) {
+    fn start_at(&mut self, turns: JointTurns, nanos: i64) {
         let marks = self.model.marks(&turns);
         self.track = Some(Track {
             turns,
             nanos,
             marks,
             velocity: None,
-            looks: vec![None; self.rig.cameras.len()],
+            inferences: vec![None; self.rig.cameras.len()],
             texture: Texture::new(&self.surface, self.rig.cameras.len()),
         });
         self.lost = 0;
@@ -343,17 +343,17 @@ impl PoseEstimator {
         };
         let known = self.track.as_mut().map(|track| std::mem::take(&mut track.texture));
         let mut texture = known.unwrap_or_else(|| Texture::new(&self.surface, self.rig.cameras.len()));
-        let before = (fitted.looked() == 0).then(|| texture.clone());
+        let before = (fitted.inferred() == 0).then(|| texture.clone());
         let (mut fitted, mut masks) = self.finish(set, &pictures, fitted, &mut texture, &mut seconds);
         if let Some(before) = before
-            && let Some(again) = self.look_after_all(set, &pictures, &fitted.turns, others, &mut seconds)?
+            && let Some(again) = self.infer_after_refinement(set, &pictures, &fitted.turns, others, &mut seconds)?
         {
             texture = before;
             (fitted, masks) = self.finish(set, &pictures, again, &mut texture, &mut seconds);
         }
-        let looked = fitted.looked();
+        let inferred = fitted.inferred();
         self.sighting = self.keeps_sightings.then(|| ShapeSighting { set: set.clone(), fitted: fitted.clone() });
-        self.remember(set, fitted.turns.clone(), fitted.looks, texture);
+        self.remember(set, fitted.turns.clone(), fitted.inferences, texture);
         Ok(PoseEstimate {
             pose: self.model.to_pose(&fitted.turns),
             masks,
@@ -362,7 +362,7 @@ impl PoseEstimator {
                 views: fitted.views,
                 residual_px: fitted.residual_px,
                 triangulated: fitted.points.iter().flatten().count(),
-                looked,
+                inferred,
                 seconds,
             },
             points: fitted.points.map(|point| point.map(|p| p.position)),
@@ -453,7 +453,7 @@ impl PoseEstimator {
     }
 
     /// Vertices and normals of a pose at a time after it, as the body has moved since the last set.
-    fn skinned(&self, turns: &Turns, set: &FrameSet, delay_secs: f64) -> (Vec<Vec3>, Vec<Vec3>) {
+    fn skinned(&self, turns: &JointTurns, set: &FrameSet, delay_secs: f64) -> (Vec<Vec3>, Vec<Vec3>) {
         self.skinned_in(&self.surface, turns, set, delay_secs)
     }
 
@@ -461,7 +461,7 @@ impl PoseEstimator {
     fn skinned_in(
         &self,
         template: &Template,
-        turns: &Turns,
+        turns: &JointTurns,
         set: &FrameSet,
         delay_secs: f64,
     ) -> (Vec<Vec3>, Vec<Vec3>) {
@@ -494,10 +494,7 @@ impl PoseEstimator {
         let read = |(frame, camera): (&'a Option<Arc<Frame>>, _)| {
             frame
                 .as_ref()
-                .map(|frame| {
-                    check_size(camera, &frame.image)?;
-                    Rgb::new(&frame.image)
-                })
+                .map(|frame| Rgb::of_camera(&frame.image, camera))
                 .transpose()
                 // A covered lens would pull the pose: the view counts as missing.
                 .map(|picture| picture.filter(|picture| !picture.is_blank()))
@@ -505,7 +502,13 @@ impl PoseEstimator {
         set.frames.iter().zip(&self.rig.cameras).map(read).collect()
     }
 
-    fn remember(&mut self, set: &FrameSet, turns: Turns, mut looks: Vec<Option<Look>>, texture: Texture) {
+    fn remember(
+        &mut self,
+        set: &FrameSet,
+        turns: JointTurns,
+        mut inferences: Vec<Option<Inference>>,
+        texture: Texture,
+    ) {
         let marks = self.model.marks(&turns);
         let velocity = self.track.as_ref().and_then(|last| {
             let dt = secs(set.master_nanos.saturating_sub(last.nanos));
@@ -520,32 +523,16 @@ impl PoseEstimator {
                 })),
             }
         });
-        let body = LookBody { nanos: set.master_nanos, turns: Arc::new(turns.clone()), marks };
-        for look in looks.iter_mut().flatten() {
-            look.body.get_or_insert_with(|| body.clone());
+        let body = InferredBody { nanos: set.master_nanos, turns: Arc::new(turns.clone()), marks };
+        for inference in inferences.iter_mut().flatten() {
+            inference.body.get_or_insert_with(|| body.clone());
         }
-        self.track = Some(Track { turns, nanos: set.master_nanos, marks, velocity, looks, texture });
+        self.track = Some(Track { turns, nanos: set.master_nanos, marks, velocity, inferences, texture });
         self.lost = 0;
     }
 }
 
-pub(crate) fn check_size(camera: &Camera, image: &Image) -> Result<(), TrackError> {
-    let (width, height) = (camera.intrinsics.width, camera.intrinsics.height);
-    if (image.width(), image.height()) == (width, height) {
-        return Ok(());
-    }
-    Err(TrackError::new(
-        TrackErrorKind::Image,
-        format!(
-            "camera {}: the image is {}x{} but its calibration is for {width}x{height}",
-            camera.id,
-            image.width(),
-            image.height()
-        ),
-    ))
-}
-
-fn finite(turns: &Turns) -> bool {
+fn finite(turns: &JointTurns) -> bool {
     turns.root.is_finite() && turns.turns.iter().all(|q| q.is_finite())
 }
 

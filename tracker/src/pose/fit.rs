@@ -14,7 +14,7 @@ use nalgebra::DVector;
 use crate::image::view::{Observation, View};
 use crate::landmarks::bias::{doubt, spread_m};
 use crate::landmarks::keypoints::LANDMARK_COUNT;
-use crate::pose::body_model::{BodyModel, Posed, Turns};
+use crate::pose::body_model::{BodyModel, JointTurns, PosedSkeleton};
 use crate::pose::line_point::{LineKind, LinePoint};
 
 /// Weight of a landmark in the fit: the face's many points are one body, and the fingers' are vague.
@@ -65,7 +65,7 @@ pub(crate) struct FitView {
 /// The pose before, and how far it may have changed.
 #[derive(Debug, Clone)]
 pub(crate) struct Before {
-    pub turns: Turns,
+    pub turns: JointTurns,
     /// Standard deviation of a joint's turn since then, radians.
     pub sigma_rad: f64,
 }
@@ -97,7 +97,7 @@ impl FitProblem<'_> {
         (0..self.model.parents.len()).filter(|&j| j == 0 || self.model.ranges[j].is_some()).collect()
     }
 
-    fn root_move(&self, turns: &Turns) -> Option<DVec3> {
+    fn root_move(&self, turns: &JointTurns) -> Option<DVec3> {
         let before = self.before.as_ref()?;
         Some((turns.root - before.turns.root) / Self::root_sigma(before))
     }
@@ -109,7 +109,7 @@ impl FitProblem<'_> {
 
     /// Calls `each` with every landmark and its pull in the world.
     #[allow(clippy::needless_range_loop)] // a landmark indexes the views' arrays and the model alike
-    fn data_terms(&self, posed: &Posed, mut each: impl FnMut(usize, DataTerm)) {
+    fn data_terms(&self, posed: &PosedSkeleton, mut each: impl FnMut(usize, DataTerm)) {
         let kernel = Kernel::Cauchy(self.robust);
         for landmark in 0..LANDMARK_COUNT {
             let mark = self.model.mark(posed, landmark);
@@ -148,7 +148,7 @@ impl FitProblem<'_> {
 
     /// Calls `each` with every point on a line, the derivative of its residual by its place in the world, the residual, the
     /// weight and the cost.
-    fn line_terms(&self, posed: &Posed, mut each: impl FnMut(&LinePoint, DVec3, f64, f64, f64)) {
+    fn line_terms(&self, posed: &PosedSkeleton, mut each: impl FnMut(&LinePoint, DVec3, f64, f64, f64)) {
         let mut counts = vec![[0.0f64; 2]; self.views.len()];
         for point in self.lines {
             counts[point.view][point.kind as usize] += 1.0;
@@ -177,7 +177,7 @@ impl FitProblem<'_> {
     }
 
     /// Calls `each` with (index among the active joints, residual, derivative by the joint's turn).
-    fn joint_terms(&self, turns: &Turns, mut each: impl FnMut(usize, DVec3, DMat3)) {
+    fn joint_terms(&self, turns: &JointTurns, mut each: impl FnMut(usize, DVec3, DMat3)) {
         for (index, joint) in self.active().into_iter().enumerate() {
             let turn = turns.turns[joint];
             if let Some(range) = &self.model.ranges[joint] {
@@ -203,18 +203,18 @@ impl FitProblem<'_> {
 
     /// Minimises from a start; gives the best pose found and the number of steps taken. `None` when even
     /// the start has no finite cost.
-    pub fn solve(&self, start: &Turns, max_steps: usize) -> Option<(Turns, usize)> {
+    pub fn solve(&self, start: &JointTurns, max_steps: usize) -> Option<(JointTurns, usize)> {
         let options = Convergence { max_steps, min_gain: 1e-4, ..Convergence::default() };
         minimize(self, start, &options).map(|solution| (solution.unknowns, solution.steps))
     }
 }
 
 impl Problem for FitProblem<'_> {
-    type Unknowns = Turns;
+    type Unknowns = JointTurns;
     type Normal = DenseNormal;
 
     /// Cost of a pose; not finite when nothing can be said.
-    fn cost(&self, turns: &Turns) -> f64 {
+    fn cost(&self, turns: &JointTurns) -> f64 {
         let posed = self.model.pose(turns);
         let mut cost = 0.0;
         self.data_terms(&posed, |_, term| cost += term.cost);
@@ -224,11 +224,11 @@ impl Problem for FitProblem<'_> {
     }
 
     /// Normal matrix and gradient at a pose; columns: root place, then three a turning joint.
-    fn linearize(&self, turns: &Turns) -> Option<DenseNormal> {
+    fn linearize(&self, turns: &JointTurns) -> Option<DenseNormal> {
         Some(self.linearize_with(turns, None))
     }
 
-    fn moved(&self, turns: &Turns, step: &DVector<f64>) -> Turns {
+    fn moved(&self, turns: &JointTurns, step: &DVector<f64>) -> JointTurns {
         let mut moved = turns.clone();
         moved.root += DVec3::new(step[0], step[1], step[2]);
         for (index, joint) in self.active().into_iter().enumerate() {
@@ -242,7 +242,7 @@ impl Problem for FitProblem<'_> {
 
 impl FitProblem<'_> {
     /// As [`Problem::linearize`], with the parameters of the shape in the last columns.
-    pub fn linearize_with(&self, turns: &Turns, shape: Option<&ShapeDerivatives>) -> DenseNormal {
+    pub fn linearize_with(&self, turns: &JointTurns, shape: Option<&ShapeDerivatives>) -> DenseNormal {
         let active = self.active();
         let pose_size = column(active.len());
         let size = pose_size + shape.map_or(0, |shape| shape.count);
@@ -357,7 +357,7 @@ pub(crate) struct ShapeDerivatives {
 
 impl ShapeDerivatives {
     /// Derivatives of the joints' world origins in a pose.
-    fn of_origins(&self, model: &BodyModel, posed: &Posed) -> Vec<Vec<DVec3>> {
+    fn of_origins(&self, model: &BodyModel, posed: &PosedSkeleton) -> Vec<Vec<DVec3>> {
         self.offsets
             .iter()
             .map(|offsets| {
@@ -389,7 +389,7 @@ impl DataTerm {
 
 /// Turn and place that bring the bind pose's trunk and head onto world points; `None` with fewer than three, or where those
 /// lie on a line.
-pub(crate) fn align_trunk(model: &BodyModel, points: &[Option<DVec3>; LANDMARK_COUNT]) -> Option<Turns> {
+pub(crate) fn align_trunk(model: &BodyModel, points: &[Option<DVec3>; LANDMARK_COUNT]) -> Option<JointTurns> {
     const TRUNK: [usize; 9] = [0, 7, 8, 11, 12, 23, 24, 25, 26];
     let pairs: Vec<PointPair> = TRUNK
         .iter()

@@ -124,7 +124,7 @@ mod tests {
     use flyrig_types::Pose;
 
     use super::*;
-    use crate::pose::body_model::Turns;
+    use crate::pose::body_model::JointTurns;
     use crate::testing::{body, mask_of, random_turns, ring};
 
     fn matched(camera: &Camera, mask: &Mask, template: &Template, pose: &Pose) -> Vec<LinePoint> {
@@ -134,7 +134,7 @@ mod tests {
         seen.match_mask(mask, 0, 0.1, 0.01)
     }
 
-    fn place(model: &BodyModel, turns: &Turns, point: &LinePoint) -> DVec3 {
+    fn place(model: &BodyModel, turns: &JointTurns, point: &LinePoint) -> DVec3 {
         let posed = model.pose(turns);
         let part = |(joint, weight, local): &(usize, f64, DVec3)| {
             (posed.origin[*joint] + posed.rotation[*joint] * *local) * *weight
@@ -153,11 +153,11 @@ mod tests {
         let view = View::new(&camera);
         let mut moved = turns.clone();
         moved.root += DVec3::new(0.02, -0.01, 0.015);
-        let distance = |point: &LinePoint, turns: &Turns| {
+        let distance = |point: &LinePoint, turns: &JointTurns| {
             let pixel = view.project(place(&model, turns, point)).unwrap();
             (pixel.dot(point.normal) - point.offset).abs() / point.sigma_px * 0.01
         };
-        let median = |turns: &Turns| {
+        let median = |turns: &JointTurns| {
             let mut all: Vec<f64> = points.iter().map(|point| distance(point, turns)).collect();
             flyrig_solve::median(&mut all).unwrap()
         };

@@ -318,9 +318,9 @@ mod tests {
     use glam::DQuat;
 
     use super::*;
-    use crate::fit;
     use crate::landmarks::keypoints::LANDMARK_COUNT;
-    use crate::pose::body_model::Turns;
+    use crate::pose::body_model::JointTurns;
+    use crate::pose::fit;
     use crate::pose::fit::FitView;
     use crate::testing::{body, fit_problem, random_turns, ring};
 
@@ -381,7 +381,7 @@ mod tests {
             Self { model: BodyModel::new(&template).unwrap(), views: views.collect(), template, cameras }
         }
 
-        fn images(&self, slot: usize, shown: &Turns) -> [Brightness; LEVELS] {
+        fn images(&self, slot: usize, shown: &JointTurns) -> [Brightness; LEVELS] {
             let (camera, view) = (&self.cameras[slot], &self.views[slot].view);
             let pose = self.model.to_pose(shown);
             let photo = photo(camera, view, &self.template, &pose);
@@ -389,13 +389,13 @@ mod tests {
             Brightness::around(&photo, camera, view, &vertices).unwrap()
         }
 
-        fn seen<R>(&self, slot: usize, turns: &Turns, each: impl FnOnce(&TexturedBody<'_>) -> R) -> R {
+        fn seen<R>(&self, slot: usize, turns: &JointTurns, each: impl FnOnce(&TexturedBody<'_>) -> R) -> R {
             let (vertices, normals) = skin_mesh(&self.template, &self.model.to_pose(turns));
             let (camera, view) = (&self.cameras[slot], &self.views[slot].view);
             each(&TexturedBody { camera, view, vertices: &vertices, normals: &normals })
         }
 
-        fn learnt(&self, turns: &Turns) -> Texture {
+        fn learnt(&self, turns: &JointTurns) -> Texture {
             let mut texture = Texture::new(&self.template, self.cameras.len());
             for slot in 0..self.cameras.len() {
                 let images = self.images(slot, turns);
@@ -405,7 +405,7 @@ mod tests {
         }
 
         /// Fits a pose to lines, which are trusted more than in the fit of a person: they alone are on trial here.
-        fn solve(&self, mut lines: Vec<LinePoint>, start: &Turns, before: &Turns) -> Turns {
+        fn solve(&self, mut lines: Vec<LinePoint>, start: &JointTurns, before: &JointTurns) -> JointTurns {
             lines.iter_mut().for_each(|line| line.sigma_px *= 0.1);
             let mut problem = fit_problem(&self.model, &self.views, 1.0);
             problem.before = Some(fit::Before { turns: before.clone(), sigma_rad: 0.15 });
@@ -414,7 +414,7 @@ mod tests {
         }
 
         /// Follows the texture from one pose to the one in the images.
-        fn follow(&self, texture: &Texture, from: &Turns, shown: &Turns) -> Turns {
+        fn follow(&self, texture: &Texture, from: &JointTurns, shown: &JointTurns) -> JointTurns {
             let images: Vec<_> = (0..self.cameras.len()).map(|slot| self.images(slot, shown)).collect();
             let mut turns = from.clone();
             for level in [0, 1, 1] {
@@ -434,7 +434,7 @@ mod tests {
         }
     }
 
-    fn mean_distance(scene: &Scene, a: &Turns, b: &Turns) -> f64 {
+    fn mean_distance(scene: &Scene, a: &JointTurns, b: &JointTurns) -> f64 {
         let (a, b) = (scene.model.marks(a), scene.model.marks(b));
         a.iter().zip(b).map(|(a, b)| a.distance(b)).sum::<f64>() / a.len() as f64
     }

@@ -37,7 +37,7 @@ impl Viewers {
             .map(|(camera, plate)| {
                 let alone = Rig { cameras: vec![camera.clone()], world_up: rig.world_up };
                 let mut estimator = PoseEstimator::new(net.clone(), template, &alone, config.clone())?;
-                estimator.look_at_all(true);
+                estimator.infer_always(true);
                 if let Some(plate) = plate {
                     estimator.set_plate(0, &plate)?;
                 }
@@ -53,15 +53,15 @@ impl Viewers {
     ///
     /// # Errors
     /// Those of [`PoseEstimator::estimate`] but `Lost`.
-    pub fn look(&mut self, set: &FrameSet) -> Result<Vec<Option<PoseEstimate>>, TrackError> {
+    pub fn estimate(&mut self, set: &FrameSet) -> Result<Vec<Option<PoseEstimate>>, TrackError> {
         self.sets += 1;
         let number = self.sets;
-        let look = |(estimator, frame): (&mut PoseEstimator, &Option<Arc<Frame>>)| match frame {
-            Some(frame) => look_alone(estimator, frame, number),
+        let estimate = |(estimator, frame): (&mut PoseEstimator, &Option<Arc<Frame>>)| match frame {
+            Some(frame) => estimate_alone(estimator, frame, number),
             None => Ok(None),
         };
         let mut found: Vec<Option<PoseEstimate>> =
-            self.alone.par_iter_mut().zip(&set.frames).map(look).collect::<Result<_, TrackError>>()?;
+            self.alone.par_iter_mut().zip(&set.frames).map(estimate).collect::<Result<_, TrackError>>()?;
         if set.present().all(|(slot, _)| found[slot].is_some()) {
             return Ok(found);
         }
@@ -76,7 +76,7 @@ impl Viewers {
                 if let Some(frame) = frame
                     && estimator.start_from(&pose, frame.capture_nanos)
                 {
-                    *found = look_alone(estimator, frame, number)?;
+                    *found = estimate_alone(estimator, frame, number)?;
                 }
                 Ok(())
             })?;
@@ -85,7 +85,7 @@ impl Viewers {
 }
 
 /// Estimates the pose in one image; `None` when nobody is found.
-fn look_alone(
+fn estimate_alone(
     estimator: &mut PoseEstimator,
     frame: &Arc<Frame>,
     index: u64,

@@ -6,7 +6,7 @@ use glam::DVec3;
 use nalgebra::DVector;
 use rayon::prelude::*;
 
-use crate::pose::body_model::{BodyModel, Turns};
+use crate::pose::body_model::{BodyModel, JointTurns};
 use crate::pose::fit::{FitProblem, ShapeDerivatives};
 use crate::pose::line_point::LinePoint;
 use crate::shape::body_shape::ShapeSpace;
@@ -29,7 +29,7 @@ pub(crate) struct ShapeSet<'a> {
 #[derive(Debug, Clone)]
 pub(crate) struct ShapeAndPoses {
     pub shape: Vec<f64>,
-    pub poses: Vec<Turns>,
+    pub poses: Vec<JointTurns>,
 }
 
 /// Shape and poses that explain all sets.
@@ -179,7 +179,7 @@ mod tests {
     use crate::pose::outline::SeenBody;
     use crate::testing::{body, fit_problem, keypoints_of, mask_of, random_turns, ring};
 
-    fn views(cameras: &[Camera], model: &BodyModel, turns: &Turns) -> Vec<FitView> {
+    fn views(cameras: &[Camera], model: &BodyModel, turns: &JointTurns) -> Vec<FitView> {
         let one = |(slot, camera): (usize, &Camera)| {
             let view = View::new(camera);
             let seen = observe(camera, &view, &keypoints_of(camera, &model.marks(turns)), 0.3);
@@ -196,8 +196,8 @@ mod tests {
 
     fn outline(
         cameras: &[Camera],
-        (truth, true_turns): (&Template, &Turns),
-        (template, model, turns): (&Template, &BodyModel, &Turns),
+        (truth, true_turns): (&Template, &JointTurns),
+        (template, model, turns): (&Template, &BodyModel, &JointTurns),
     ) -> Vec<LinePoint> {
         let true_model = BodyModel::new(truth).unwrap();
         let (vertices, normals) = skin_mesh(template, &model.to_pose(turns));
@@ -232,7 +232,7 @@ mod tests {
         let (space, values, truth) = person();
         let rig = ring(3);
         let true_model = BodyModel::new(&truth).unwrap();
-        let true_turns: Vec<Turns> = (0..4).map(|seed| random_turns(&true_model, seed)).collect();
+        let true_turns: Vec<JointTurns> = (0..4).map(|seed| random_turns(&true_model, seed)).collect();
         let mut at = ShapeAndPoses {
             shape: space.prior().iter().map(|(_, mean, _)| *mean).collect(),
             poses: true_turns.clone(),

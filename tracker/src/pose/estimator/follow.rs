@@ -35,20 +35,21 @@ impl PoseEstimator {
             config: &self.config,
         };
         let sightings = self.search.step(&scene)?;
-        let looks: Vec<Option<Look>> = sightings.into_iter().map(|sighting| sighting.map(Look::fresh)).collect();
+        let inferences: Vec<Option<Inference>> =
+            sightings.into_iter().map(|sighting| sighting.map(Inference::fresh)).collect();
         seconds.search += start.elapsed().as_secs_f64();
-        if looks.iter().all(Option::is_none) {
+        if inferences.iter().all(Option::is_none) {
             return Err(TrackError::lost(format!("frame set {}: nobody found yet; the search goes on", set.index)));
         }
-        let first = self.fit(set, looks, None, seconds)?;
-        // Look again through crops around the fitted body: turned upright, and in the views that chose nobody.
+        let first = self.fit(set, inferences, None, seconds)?;
+        // Inference again through crops around the fitted body: turned upright, and in the views that chose nobody.
         let marks = self.model.marks(&first.turns);
         let start = Track {
             turns: first.turns.clone(),
             nanos: set.master_nanos,
             marks,
             velocity: None,
-            looks: vec![None; self.rig.cameras.len()],
+            inferences: vec![None; self.rig.cameras.len()],
             texture: Texture::default(),
         };
         match self.follow(set, pictures, (&start, &start.marks), others, seconds)? {
@@ -57,25 +58,25 @@ impl PoseEstimator {
         }
     }
 
-    /// The views that the network looks at again when the body's landmarks are at `marks`.
+    /// The views that the network inferences at again when the body's landmarks are at `marks`.
     fn due(&self, set: &FrameSet, pictures: &[Option<Rgb<'_>>], track: &Track, marks: &Marks) -> Vec<bool> {
         // How far somebody has moved who was seen once, nobody can predict.
-        let (look_after_m, most) = match (self.looks_at_all || track.velocity.is_none(), self.config.looks) {
+        let (look_after_m, most) = match (self.infers_always || track.velocity.is_none(), self.config.max_inferences) {
             (true, _) => (0.0, usize::MAX),
             (false, 0) => (self.config.look_after_m, usize::MAX),
             (false, most) => (self.config.look_after_m, most),
         };
         let has_image = |slot: usize| pictures.get(slot).is_some_and(Option::is_some);
-        due(&track.looks, has_image, marks, set.master_nanos, look_after_m, most)
+        due(&track.inferences, has_image, marks, set.master_nanos, look_after_m, most)
     }
 
-    /// Looks after all where outlines and texture have moved the body of a set without a look farther than was predicted;
-    /// `None` where they have not, or where the looks agree with nobody.
-    pub(super) fn look_after_all(
+    /// Looks after all where outlines and texture have moved the body of a set without a inference farther than was predicted;
+    /// `None` where they have not, or where the inferences agree with nobody.
+    pub(super) fn infer_after_refinement(
         &self,
         set: &FrameSet,
         pictures: &[Option<Rgb<'_>>],
-        turns: &Turns,
+        turns: &JointTurns,
         others: &[Marks],
         seconds: &mut StageSeconds,
     ) -> Result<Option<Fitted>, TrackError> {
@@ -87,7 +88,7 @@ impl PoseEstimator {
         self.follow(set, pictures, (track, &marks), others, seconds)
     }
 
-    /// One look through crops around the landmarks where they are expected; `None` when the person is not there any more.
+    /// One inference through crops around the landmarks where they are expected; `None` when the person is not there any more.
     fn follow(
         &self,
         set: &FrameSet,
@@ -98,24 +99,24 @@ impl PoseEstimator {
     ) -> Result<Option<Fitted>, TrackError> {
         let start = Instant::now();
         let due = self.due(set, pictures, track, predicted);
-        let look = |slot: usize| -> Result<Option<Look>, TrackError> {
+        let inference = |slot: usize| -> Result<Option<Inference>, TrackError> {
             let Some(picture) = &pictures[slot] else { return Ok(None) };
             let camera = &self.rig.cameras[slot];
             let expected = project_all(camera, predicted);
             let Some(crop) = Crop::around(&expected) else { return Ok(None) };
-            let sighting = Sighting::take(&self.net, picture, crop)?;
+            let sighting = Sighting::infer(&self.net, picture, crop)?;
             // Two people in one crop: the network may have chosen the other one.
             let own = sighting.mean_distance(&expected).unwrap_or(f64::INFINITY);
             let is_other = |marks| sighting.mean_distance(&project_all(camera, marks)).is_some_and(|d| d < own);
-            Ok((!others.iter().any(is_other)).then(|| Look::fresh(sighting)))
+            Ok((!others.iter().any(is_other)).then(|| Inference::fresh(sighting)))
         };
         let slots: Vec<usize> = (0..pictures.len()).filter(|&slot| due[slot]).collect();
-        let mut looks = track.looks.clone();
-        for (slot, look) in slots.iter().zip(beside_each_other(slots.len(), |at| look(slots[at]))) {
-            looks[*slot] = look?;
+        let mut inferences = track.inferences.clone();
+        for (slot, inference) in slots.iter().zip(beside_each_other(slots.len(), |at| inference(slots[at]))) {
+            inferences[*slot] = inference?;
         }
         seconds.net += start.elapsed().as_secs_f64();
-        match self.fit(set, looks, Some((track, predicted)), seconds) {
+        match self.fit(set, inferences, Some((track, predicted)), seconds) {
             Ok(fitted) if fitted.relative < OFF_TRACK => Ok(Some(fitted)),
             Ok(_) => Ok(None),
             Err(error) if error.kind == TrackErrorKind::Lost => Ok(None),
@@ -126,18 +127,18 @@ impl PoseEstimator {
     fn fit(
         &self,
         set: &FrameSet,
-        looks: Vec<Option<Look>>,
+        inferences: Vec<Option<Inference>>,
         track: Option<(&Track, &[DVec3; LANDMARK_COUNT])>,
         seconds: &mut StageSeconds,
     ) -> Result<Fitted, TrackError> {
         let config = &self.config;
         let lost = |what: &str| TrackError::lost(format!("frame set {}: {what}", set.index));
-        let sees = |look: &&Look| look.sighting.output.presence >= config.presence_threshold;
-        let keypoints: Vec<Option<ViewKeypoints>> = looks
+        let sees = |inference: &&Inference| inference.sighting.output.presence >= config.presence_threshold;
+        let keypoints: Vec<Option<ViewKeypoints>> = inferences
             .iter()
-            .map(|look| {
-                let look = look.as_ref().filter(|look| look.body.is_none());
-                look.filter(sees).map(|look| look.sighting.keypoints)
+            .map(|inference| {
+                let inference = inference.as_ref().filter(|inference| inference.body.is_none());
+                inference.filter(sees).map(|inference| inference.sighting.keypoints)
             })
             .collect();
         let start = Instant::now();
@@ -152,11 +153,11 @@ impl PoseEstimator {
             let delay_secs = delay_secs.clamp(-MAX_DELAY_SECS, MAX_DELAY_SECS);
             let mut seen = [None; LANDMARK_COUNT];
             let mut shift = [DVec3::ZERO; LANDMARK_COUNT];
-            if let Some(look) = looks[slot].as_ref().filter(sees) {
+            if let Some(inference) = inferences[slot].as_ref().filter(sees) {
                 // Hidden landmarks as well: the network guesses where they are, and the fit knows how well.
-                seen = observe(camera, &view, &look.sighting.keypoints, 0.0);
+                seen = observe(camera, &view, &inference.sighting.keypoints, 0.0);
                 if let Some((track, predicted)) = track {
-                    for (i, (carried, trust)) in look.carried(&track.marks, predicted).into_iter().enumerate() {
+                    for (i, (carried, trust)) in inference.carried(&track.marks, predicted).into_iter().enumerate() {
                         shift[i] = track.motion(i, delay_secs) + carried;
                         seen[i] = seen[i].map(|seen| Observation { trust, ..seen });
                     }
@@ -174,7 +175,7 @@ impl PoseEstimator {
         let triangulated = points.iter().flatten().count();
         let mut world = points.each_ref().map(|point| point.as_ref().map(|p| p.position));
         if triangulated < MIN_LANDMARKS {
-            let sightings = looks.iter().map(|look| look.as_ref().map(|look| &*look.sighting));
+            let sightings = inferences.iter().map(|inference| inference.as_ref().map(|inference| &*inference.sighting));
             let seen = keypoints.iter().zip(sightings).zip(&self.rig.cameras);
             let surest = seen
                 .filter_map(|((k, s), camera)| k.as_ref().and(s).map(|s| (s, camera)))
@@ -191,7 +192,7 @@ impl PoseEstimator {
                 let dt = secs(set.master_nanos.saturating_sub(track.nanos));
                 let sigma_rad = config.smooth_rad * (dt * 30.0).clamp(0.1, 30.0).sqrt();
                 evidence.before = Some(Before { turns: track.turns.clone(), sigma_rad });
-                let has_news = looks.iter().flatten().any(|look| look.body.is_none());
+                let has_news = inferences.iter().flatten().any(|inference| inference.body.is_none());
                 if has_news {
                     evidence.problem(&self.model, config).solve(&track.turns, config.max_steps)
                 } else {
@@ -217,14 +218,15 @@ impl PoseEstimator {
         };
         seconds.fit += start.elapsed().as_secs_f64();
         let (turns, _) = turns.filter(|(turns, _)| finite(turns)).ok_or_else(|| lost("the fit has no finite cost"))?;
-        self.judge(turns, looks, keypoints, points, evidence).ok_or_else(|| lost("no landmark agrees with the fit"))
+        self.judge(turns, inferences, keypoints, points, evidence)
+            .ok_or_else(|| lost("no landmark agrees with the fit"))
     }
 
     /// Distances of the landmarks from the fitted body.
     fn judge(
         &self,
-        turns: Turns,
-        looks: Vec<Option<Look>>,
+        turns: JointTurns,
+        inferences: Vec<Option<Inference>>,
         keypoints: Vec<Option<ViewKeypoints>>,
         points: [Option<WorldPoint>; LANDMARK_COUNT],
         evidence: Evidence,
@@ -233,8 +235,8 @@ impl PoseEstimator {
         let mut all = Vec::new();
         let mut all_relative = Vec::new();
         let mut views = Vec::with_capacity(keypoints.len());
-        for (slot, look) in looks.iter().enumerate() {
-            let presence = look.as_ref().map_or(0.0, |look| look.sighting.output.presence);
+        for (slot, inference) in inferences.iter().enumerate() {
+            let presence = inference.as_ref().map_or(0.0, |inference| inference.sighting.output.presence);
             let mut distances = Vec::new();
             let mut inliers = 0;
             let fit_view = evidence.views.iter().find(|view| view.slot == slot);
@@ -265,7 +267,7 @@ impl PoseEstimator {
         let relative = median(&mut all_relative)?;
         (residual_px.is_finite() && relative.is_finite()).then_some(Fitted {
             turns,
-            looks,
+            inferences,
             keypoints,
             points,
             views,

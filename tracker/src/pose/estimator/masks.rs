@@ -25,21 +25,21 @@ impl PoseEstimator {
                     }
                 };
                 let gate = gate.ok_or(NoMask::OutOfView)?;
-                let look = fitted.looks[slot].as_ref();
-                let look = look.filter(|l| l.sighting.output.presence >= self.config.presence_threshold);
+                let inference = fitted.inferences[slot].as_ref();
+                let inference = inference.filter(|l| l.sighting.output.presence >= self.config.presence_threshold);
                 let light = self.background(slot).and_then(|known| known.light(picture, &|at| !gate.reaches_pixel(at)));
                 let evidence = light.as_ref().and_then(|light| light.evidence(picture, gate.bounds));
-                let mask = match (look, &evidence) {
-                    (Some(look), evidence) => {
-                        let coarse = match (&look.body, &look.sighting.output.mask) {
+                let mask = match (inference, &evidence) {
+                    (Some(inference), evidence) => {
+                        let coarse = match (&inference.body, &inference.sighting.output.mask) {
                             (Some(body), Some(mask)) => {
                                 let (then, _) = self.skinned(&body.turns, set, fitted.delay_secs(slot));
                                 let (then, now) = (corners(camera, &then), corners(camera, &vertices));
-                                carried_mask(mask, look.sighting.crop, &then, &now, gate.bounds)
+                                carried_mask(mask, inference.sighting.crop, &then, &now, gate.bounds)
                             }
-                            _ => coarse_mask(&look.sighting, &gate),
+                            _ => coarse_mask(&inference.sighting, &gate),
                         };
-                        refine(picture, &coarse, look.sighting.crop.scale(), &gate, evidence.as_ref())
+                        refine(picture, &coarse, inference.sighting.crop.scale(), &gate, evidence.as_ref())
                     }
                     // The network sees nobody here, but the other cameras place the body in this image.
                     (None, Some(evidence))

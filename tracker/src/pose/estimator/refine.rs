@@ -33,7 +33,7 @@ impl PoseEstimator {
         fitted: &Fitted,
         masks: &[Option<&Mask>],
         texture: &mut Texture,
-    ) -> Turns {
+    ) -> JointTurns {
         let mut turns = fitted.turns.clone();
         let mut body = self.posed(set, fitted, &turns);
         let of_view = |view: &FitView| {
@@ -72,14 +72,14 @@ impl PoseEstimator {
         &self,
         set: &FrameSet,
         fitted: &Fitted,
-        turns: &Turns,
+        turns: &JointTurns,
         masks: &[Option<&Mask>],
         widen: f64,
     ) -> Vec<LinePoint> {
         self.outline_points(fitted, &self.posed(set, fitted, turns), masks, widen)
     }
 
-    fn posed(&self, set: &FrameSet, fitted: &Fitted, turns: &Turns) -> PosedBody {
+    fn posed(&self, set: &FrameSet, fitted: &Fitted, turns: &JointTurns) -> PosedBody {
         let own = |view: &FitView| {
             (view.delay_secs.abs() > MIN_DELAY_SECS).then(|| self.skinned(turns, set, view.delay_secs))
         };

@@ -46,7 +46,7 @@ impl PoseEstimator {
             places.push(found.as_ref().ok().map(|fitted| self.model.marks(&fitted.turns)));
             match found {
                 Ok(fitted) => {
-                    self.remember(set, fitted.turns.clone(), fitted.looks.clone(), Texture::default());
+                    self.remember(set, fitted.turns.clone(), fitted.inferences.clone(), Texture::default());
                     sightings.push(ShapeSighting { set: set.clone(), fitted });
                 }
                 Err(error) => last = Some(error),
@@ -110,7 +110,7 @@ impl PoseEstimator {
     }
 
     /// Moves a body that was as tall as `before` to where the template fills the same part of a single camera's image.
-    fn resized(&self, mut turns: Turns, before: f64) -> Turns {
+    fn resized(&self, mut turns: JointTurns, before: f64) -> JointTurns {
         if let [camera] = self.rig.cameras.as_slice() {
             turns.root = camera.position().lerp(turns.root, height_m(&self.template) / before);
         }
@@ -118,7 +118,7 @@ impl PoseEstimator {
     }
 
     /// Height of a person whose feet stand on the floor, from one camera, metres; `None` where that is no person's height, or the
-    /// camera does not look down on the feet.
+    /// camera does not inference down on the feet.
     fn height_on_floor(&self, camera: &Camera, sightings: &[ShapeSighting]) -> Option<f64> {
         let body = |sighting: &ShapeSighting| skin_mesh(&self.surface, &self.model.to_pose(&sighting.fitted.turns)).0;
         let bodies: Vec<Vec<Vec3>> = sightings.iter().map(body).collect();
@@ -129,10 +129,10 @@ impl PoseEstimator {
     /// Follows the person, or searches whole images: nobody waits for the set.
     fn find_at_once(&mut self, set: &FrameSet, others: &[Marks]) -> Result<Fitted, TrackError> {
         let pictures = self.check(set)?;
-        let given = (self.config.search_crops, self.looks_at_all);
-        (self.config.search_crops, self.looks_at_all) = (0, true);
+        let given = (self.config.search_crops, self.infers_always);
+        (self.config.search_crops, self.infers_always) = (0, true);
         let found = self.follow_or_search(set, &pictures, others, true, &mut StageSeconds::default());
-        (self.config.search_crops, self.looks_at_all) = given;
+        (self.config.search_crops, self.infers_always) = given;
         found
     }
 
