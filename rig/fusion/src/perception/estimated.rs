@@ -433,7 +433,7 @@ fn count_stages(estimate: &PoseEstimate, stages: &mut StageTimes) {
     ] {
         stages.add(stage, Duration::from_secs_f64(seconds.max(0.0)));
     }
-    stages.count("views that the network looked at", estimate.quality.looked as u64);
+    stages.count("pose network inferences", estimate.quality.inferred as u64);
 }
 
 impl Perception for EstimatedPerception {
@@ -470,7 +470,7 @@ impl Perception for EstimatedPerception {
         self.mattes = effort.mattes;
         for place in &mut self.places {
             let config = place.estimator.config_mut();
-            config.looks = effort.looks;
+            config.max_inferences = effort.looks;
             config.search_crops = effort.search_crops;
             config.outline_rounds = self.rounds.min(effort.rounds);
         }
