@@ -1,4 +1,4 @@
-//! Crops around hands and faces, and what the networks saw in them.
+//! Crops around hands and faces, the last inference in each, and its staleness.
 
 use flyrig_solve::RigidMotion;
 use flyrig_types::Camera;
@@ -9,18 +9,18 @@ use crate::image::crop::Crop;
 use crate::image::view::View;
 use crate::pose::body_model::{BodyModel, PosedSkeleton};
 
-/// A look says nothing any more after this long, seconds.
+/// Age at which an inference expires, seconds.
 pub(crate) const FORGET_SECS: f64 = 0.4;
-/// A look of this age counts half, seconds.
+/// Age at which the weight of an inference is halved, seconds.
 const HALF_SECS: f64 = 0.12;
-/// A look grows old by this much a second, metres: fingers move while the wrist rests.
+/// Staleness that an inference gains with age, metres per second: fingers move while the wrist rests.
 const AGING_M_PER_SEC: f64 = 0.05;
-/// Landmarks between the wrist and the middle joints, which frame a crop: the original tracks hands by them.
+/// Landmarks between the wrist and the middle joints, which frame a crop as in the original's hand tracking.
 const PALM: [usize; 12] = [0, 1, 2, 3, 5, 6, 9, 10, 13, 14, 17, 18];
-/// Side of a crop in lengths of the palm's frame, and its shift towards the fingers: those that the network was trained with.
+/// Side of a crop as a multiple of the palm's frame, and its shift towards the fingers: those that the network was trained with.
 const HAND_MARGIN: f64 = 2.0;
 const HAND_SHIFT: f64 = 0.1;
-/// A crop takes at least so many lengths of the hand, however it is foreshortened.
+/// Least side of a crop, lengths of the unforeshortened hand.
 const LEAST_HANDS: f64 = 1.3;
 /// Height of a face on a body of 1.7 m, metres, and the crop's side in heights.
 pub(crate) const FACE_M: f64 = 0.18;
@@ -32,47 +32,49 @@ const FACING: f64 = 0.2;
 #[derive(Debug, Clone)]
 pub(crate) struct PartInference {
     pub nanos: i64,
-    /// Pixels from the principal point, without distortion; `None` where a landmark cannot be used.
+    /// Undistorted pixels from the principal point; `None` for unusable landmarks.
     pub seen: Vec<Option<DVec2>>,
     pub presence: f64,
-    /// The hand or the head by the body's pose when the image was taken.
+    /// Hand or head by the body's pose at the image's time, world frame.
     pub frame: RigidMotion,
 }
 
 impl PartInference {
-    /// How much a new look is needed, metres.
+    /// Returns the motion of the part since, metres: of its joint, of flesh at `reach_m` through rotation, and a share of age.
     pub fn staleness_m(&self, frame: &RigidMotion, reach_m: f64, nanos: i64) -> f64 {
         let turned = self.frame.rotation.angle_between(frame.rotation) * reach_m;
         self.frame.translation.distance(frame.translation) + turned + AGING_M_PER_SEC * self.age_secs(nanos)
     }
 
-    /// Importance at a later time, 0..=1.
+    /// Returns the weight at a later time, 0..=1.
     pub fn trust(&self, nanos: i64) -> f64 {
         self.presence / (1.0 + (self.age_secs(nanos) / HALF_SECS).powi(2))
     }
 
+    /// Returns the age at a later time, seconds.
     pub fn age_secs(&self, nanos: i64) -> f64 {
         1e-9 * nanos.saturating_sub(self.nanos).max(0) as f64
     }
 
-    /// From the world now to the world when the image was taken, as far as the wrist or the head moved.
+    /// Returns the motion of the part from now to the image's time, world frame.
     pub fn carry(&self, frame: &RigidMotion) -> RigidMotion {
         self.frame * frame.inverse()
     }
 }
 
+/// Whether a pixel lies in the image.
 fn inside(camera: &Camera, pixel: DVec2) -> bool {
     let size = DVec2::new(f64::from(camera.intrinsics.width), f64::from(camera.intrinsics.height));
     pixel.cmpgt(DVec2::ZERO).all() && pixel.cmplt(size).all()
 }
 
-/// The x axis of a crop whose `up` points up.
+/// Returns the x axis of a crop in which `up` points up.
 fn turn_of(up: DVec2) -> DVec2 {
     up.perp().normalize_or(DVec2::X)
 }
 
-/// The crop around a hand whose landmarks are expected at world points. `length_px` is the hand's length in the image.
-/// `None` where the hand is out of the image.
+/// Returns the crop around a hand whose landmarks are expected at world points (metres); `length_px` is the hand's length in the image.
+/// `None` when the hand is out of the image.
 pub(crate) fn hand_crop(camera: &Camera, points: &[DVec3; HAND_LANDMARKS], length_px: f64) -> Option<Crop> {
     let mut pixels = [DVec2::ZERO; HAND_LANDMARKS];
     for (pixel, point) in pixels.iter_mut().zip(points) {
@@ -90,7 +92,7 @@ pub(crate) fn hand_crop(camera: &Camera, points: &[DVec3; HAND_LANDMARKS], lengt
     (side.is_finite() && (4.0..1e4).contains(&side) && inside(camera, crop.center)).then_some(crop)
 }
 
-/// A face in an image.
+/// Face in an image.
 #[derive(Debug, Clone, Copy)]
 pub(crate) struct FaceTarget {
     pub crop: Crop,
@@ -99,7 +101,7 @@ pub(crate) struct FaceTarget {
 }
 
 impl FaceTarget {
-    /// The face of a posed body; `None` where it looks away from the camera or is out of the image.
+    /// Returns the face of a posed body; `None` when it faces away from the camera or is out of the image.
     pub fn new(camera: &Camera, model: &BodyModel, posed: &PosedSkeleton, scale: f64) -> Option<Self> {
         const EYES: [usize; 2] = [2, 5];
         const MOUTH: [usize; 2] = [9, 10];

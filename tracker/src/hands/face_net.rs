@@ -1,4 +1,4 @@
-//! Face landmarks of one crop.
+//! The face landmark network (MediaPipe Face Mesh, Kartynnik et al. 2019).
 
 use glam::DVec2;
 
@@ -7,12 +7,12 @@ use crate::network::landmark_net::{LandmarkNet, sigmoid};
 
 /// Side of the network's crop, pixels.
 pub const FACE_SIDE: usize = 192;
-/// Landmarks on the surface of a face.
+/// Number of landmarks on the surface of a face.
 pub const FACE_LANDMARKS: usize = 468;
 
 static EMBEDDED: &[u8] = include_bytes!("../../assets/face.onnx");
 
-/// The face landmark network (MediaPipe Face Mesh, Kartynnik et al. 2019; licence beside the file in `assets`).
+/// Network that finds landmarks of a face in a crop; its licence is beside the file in `assets`.
 #[derive(Clone)]
 pub struct FaceNet {
     net: LandmarkNet,

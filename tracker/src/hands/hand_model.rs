@@ -131,7 +131,7 @@ impl HandModel {
         bent
     }
 
-    /// JointTurns of a finger's joints away from rest, canonical axes.
+    /// Returns the rotations of a finger's joints away from rest, canonical axes.
     pub fn turns(&self, finger: usize, [first, spread, second, third]: Bend) -> [DQuat; 3] {
         let axes = &self.axes[finger];
         [axes.turn(first, spread), axes.turn(second, 0.0), axes.turn(third, 0.0)]

@@ -1,4 +1,4 @@
-//! Hand landmarks of one crop.
+//! The hand landmark network (MediaPipe Hands, Zhang et al. 2020, lite).
 
 use glam::DVec2;
 
@@ -7,12 +7,12 @@ use crate::network::landmark_net::LandmarkNet;
 
 /// Side of the network's crop, pixels.
 pub const HAND_SIDE: usize = 224;
-/// Landmarks of a hand: wrist, then four of each finger from the palm to the tip, thumb first.
+/// Number of landmarks of a hand: wrist, then four of each finger from the palm to the tip, thumb first.
 pub const HAND_LANDMARKS: usize = 21;
 
 static EMBEDDED: &[u8] = include_bytes!("../../assets/hand_lite.onnx");
 
-/// The hand landmark network (MediaPipe Hands, Zhang et al. 2020, lite; licence beside the file in `assets`).
+/// Network that finds landmarks of a hand in a crop; its licence is beside the file in `assets`.
 #[derive(Clone)]
 pub struct HandNet {
     net: LandmarkNet,

@@ -1,4 +1,8 @@
-//! Where the landmark network points, relative to the joints and places on the skin that its landmarks are named after.
+//! Systematic bias and spread of the pose network's landmarks, relative to the joints and places on the skin that they are named
+//! after.
+//!
+//! Both are measured on simulated people whose pose is known ([`LandmarkStudy`](crate::LandmarkStudy)). The fit places
+//! landmarks with their bias and divides residuals by their spread, which grows as the confidence falls.
 
 use flyrig_body::Template;
 use glam::DVec3;
@@ -6,16 +10,16 @@ use glam::DVec3;
 use crate::landmarks::keypoints::{LANDMARK_COUNT, NOSE};
 use crate::landmarks::surface_marks::BodyMark;
 
-/// A landmark of the left side or the middle; the right side is its mirror image.
+/// Measurement of a landmark of the left side or the middle; the right side is its mirror image.
 struct Measured {
     landmark: usize,
-    /// From the anatomical place, canonical axes of the part that carries it, on a body of 1.7 m.
+    /// Offset from the anatomical place, canonical axes of the part that carries it, millimetres on a body of 1.7 m.
     bias_mm: [f64; 3],
-    /// Standard deviation about it in an image, at the body's depth.
+    /// Standard deviation about it in an image, millimetres at the body's depth.
     spread_mm: f64,
 }
 
-/// Printed by `flyrig-bench landmarks` for eight simulated people (seeds 301 to 308, a motion each, 7 cameras, 30 frames).
+/// Biases and spreads as printed by `flyrig-bench landmarks` for eight simulated people (seeds 301 to 308, a motion each, 7 cameras, 30 frames).
 /// The signs are anatomy: the network's hips lie at the outer hip bone, its shoulders on top of the joint.
 const MEASURED: [Measured; 17] = [
     Measured { landmark: 0, bias_mm: [-4.0, 4.0, -10.0], spread_mm: 14.0 },
@@ -37,12 +41,12 @@ const MEASURED: [Measured; 17] = [
     Measured { landmark: 31, bias_mm: [-1.0, -7.0, -5.0], spread_mm: 28.0 },
 ];
 
-/// Confidence of a landmark, and its spread as a multiple of a sure one's: nine of ten lie within it. Printed by the same command for twelve
-/// further people (seeds 401 to 412): the network guesses where hidden joints are, and not badly.
+/// Confidence of a landmark, and its spread as a multiple of a sure one's (90 % lie within it), as printed by the same command for
+/// twelve further people (seeds 401 to 412): the network guesses hidden joints fairly well.
 const DOUBTS: [(f64, f64); 8] =
     [(0.025, 7.4), (0.075, 4.6), (0.15, 4.4), (0.25, 3.6), (0.4, 2.5), (0.6, 1.6), (0.8, 1.2), (0.95, 1.0)];
 
-/// Returns the standard deviation of a landmark of a confidence (0..1) as a multiple of [`spread_m`].
+/// Returns the standard deviation of a landmark of a confidence (0..=1) as a multiple of [`spread_m`].
 pub(crate) fn doubt(confidence: f64) -> f64 {
     let after = DOUBTS.iter().position(|(at, _)| *at >= confidence).unwrap_or(DOUBTS.len() - 1).max(1);
     let [(from, low), (to, high)] = [DOUBTS[after - 1], DOUBTS[after]];
@@ -64,11 +68,12 @@ pub(crate) fn spread_m(landmark: usize) -> f64 {
     1e-3 * measured(landmark).map_or(20.0, |measured| measured.spread_mm)
 }
 
+/// Returns the measurement of a landmark.
 fn measured(landmark: usize) -> Option<&'static Measured> {
     MEASURED.iter().find(|known| known.landmark == left_of(landmark))
 }
 
-/// Height of a template over that of the body that biases are stated for.
+/// Returns the height of a template over that of the body that biases are stated for, 1.7 m.
 pub(crate) fn template_scale(template: &Template) -> f64 {
     let heights = template.positions.iter().map(|p| f64::from(p.y));
     let (low, high) = heights.fold((f64::INFINITY, f64::NEG_INFINITY), |(low, high), y| (low.min(y), high.max(y)));
@@ -80,7 +85,7 @@ pub(crate) fn is_right(landmark: usize) -> bool {
     left_of(landmark) != landmark
 }
 
-/// The landmark of the left side that a landmark mirrors, or itself.
+/// Returns the landmark of the left side that a landmark mirrors, or itself.
 pub(crate) fn left_of(landmark: usize) -> usize {
     match landmark {
         NOSE => NOSE,

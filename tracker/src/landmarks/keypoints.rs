@@ -1,8 +1,8 @@
-//! BlazePose's 33 body landmarks.
+//! The 33 body landmarks of BlazePose: names, order, and their places in an image.
 
 use glam::DVec2;
 
-/// How many body landmarks there are.
+/// Number of body landmarks.
 pub const LANDMARK_COUNT: usize = 33;
 
 /// Names of the landmarks in the order of the network ("left" is the person's left).
@@ -42,7 +42,7 @@ pub const LANDMARK_NAMES: [&str; LANDMARK_COUNT] = [
     "right toes",
 ];
 
-/// One landmark in one image.
+/// Landmark in one image.
 #[derive(Debug, Clone, Copy, PartialEq, Default)]
 pub struct Keypoint {
     /// Pixels of the image; pixel centres at integers. May lie outside the image.
@@ -52,14 +52,14 @@ pub struct Keypoint {
 }
 
 impl Keypoint {
-    /// Whether the point may be used at all.
+    /// Whether the point is finite and has any confidence.
     #[must_use]
     pub fn usable(&self) -> bool {
         self.pixel.is_finite() && self.confidence.is_finite() && self.confidence > 0.0
     }
 }
 
-/// The landmarks of one view.
+/// Landmarks of one view.
 pub type ViewKeypoints = [Keypoint; LANDMARK_COUNT];
 
 pub(crate) const NOSE: usize = 0;

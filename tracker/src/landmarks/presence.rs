@@ -1,4 +1,4 @@
-//! Whether an image shows anybody.
+//! Test for people in an image, for plates that must show none.
 
 use flyrig_types::Image;
 
@@ -11,7 +11,7 @@ use crate::pose::config::PoseConfig;
 /// Least probability of a person: an empty room has furniture that looks a little like one.
 const SURE: f64 = 0.8;
 
-/// Returns whether the pose network finds a person anywhere in an image. Takes about a second.
+/// Whether the pose network finds a person anywhere in an image. Takes about a second.
 ///
 /// # Errors
 /// Kinds `Image` and `Net` when the image cannot be read or the network fails.

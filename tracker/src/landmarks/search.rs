@@ -1,4 +1,8 @@
-//! Finding the person: crops over the whole image, and agreement between the views.
+//! Search for a person who may be anywhere, spread over frame sets so that none takes long.
+//!
+//! Each step runs the network around foreground that differs from the background, where other views have found a person, and on
+//! the next few of the crops that cover the whole image. Hypotheses of the views are joined by triangulation: the person whom
+//! most views agree on wins, with preference for the place that the cameras look at.
 
 use std::sync::Arc;
 
@@ -18,16 +22,16 @@ use crate::masks::background::Background;
 use crate::network::pose_net::PoseNet;
 use crate::pose::config::PoseConfig;
 
-/// Hypotheses kept an image.
+/// Hypotheses kept per image.
 const KEEP: usize = 4;
 
-/// Hypotheses older than this are forgotten, nanoseconds: a person walks on.
+/// Age at which a hypothesis is forgotten, nanoseconds: a person walks on.
 const FORGET_NANOS: i64 = 1_000_000_000;
 /// Distance from the cameras' common centre that halves a person's score, metres.
 const NEAR_CENTER_M: f64 = 2.0;
-/// A crop around a piece of foreground is larger by this factor.
+/// Side of a crop around a piece of foreground, as a multiple of its size.
 const BLOB_MARGIN: f64 = 1.25;
-/// Pieces of foreground that are looked at in an image.
+/// Pieces of foreground that are tried per image.
 const BLOBS: usize = 2;
 
 /// Images, background and known people of a search.
@@ -35,40 +39,39 @@ pub(crate) struct SearchScene<'a> {
     pub net: &'a PoseNet,
     pub cameras: &'a [Camera],
     pub pictures: &'a [Option<Rgb<'a>>],
-    /// By slot.
+    /// Backgrounds in rig order.
     pub backgrounds: &'a [Option<Arc<Background>>],
     pub nanos: i64,
-    /// Point nearest to the cameras' optical axes, world metres. People near it are preferred.
+    /// Point nearest to the cameras' optical axes, world metres; people near it are preferred.
     pub center: DVec3,
     /// Landmarks of people who are tracked already.
     pub taken: &'a [[DVec3; LANDMARK_COUNT]],
     pub config: &'a PoseConfig,
 }
 
-/// The search for a person who may be anywhere, spread over sets so that none takes long.
-///
-/// Each step looks where the image differs from the empty scene, where other views have seen somebody, and at the next few of
-/// the crops that cover the whole image.
+/// State of a search between frame sets.
 #[derive(Debug, Clone, Default)]
 pub(crate) struct Search {
     views: Vec<ViewSearch>,
 }
 
+/// Search in one view.
 #[derive(Debug, Clone, Default)]
 struct ViewSearch {
     /// Next crop of those that cover the image.
     next: usize,
-    /// Whether all of them were looked at since the search began.
+    /// Whether all of them were tried since the search began.
     swept: bool,
     /// Whether there was a hypothesis in the last step.
     has_hope: bool,
-    /// Hypotheses, best first, and the times that they were seen at.
+    /// Hypotheses, best first, with the time of their image in nanoseconds.
     found: Vec<(Sighting, i64)>,
 }
 
 impl Search {
-    /// Looks further and returns the person whom most views agree on, by slot. Without agreement, and once every image was
-    /// looked at as a whole, the surest and largest sighting of one view. No sighting at all: go on with the next set.
+    /// Continues the search and returns the sightings of the person whom most views agree on, in rig order. Without agreement,
+    /// once every image was searched as a whole, this is the surest and largest sighting of one view. Without any sighting the search
+    /// goes on in the next frame set.
     pub fn step(&mut self, scene: &SearchScene<'_>) -> Result<Vec<Option<Sighting>>, TrackError> {
         self.views.resize_with(scene.cameras.len(), ViewSearch::default);
         self.views
@@ -81,7 +84,7 @@ impl Search {
             self.views.iter().map(|view| view.found.iter().map(|(sighting, _)| sighting.clone()).collect()).collect();
         let choice = choose(scene, &found);
         let agreed = choice.iter().flatten().count() > 1;
-        // Nobody can disagree with a single camera.
+        // A single camera has no other to agree with.
         let is_alone = scene.pictures.iter().flatten().count() == 1;
         let searched = |view: &ViewSearch| view.swept || (is_alone && !view.found.is_empty());
         let searched_everywhere =
@@ -97,7 +100,7 @@ impl Search {
         Ok(found.into_iter().zip(choice).map(|(mut found, index)| index.map(|i| found.swap_remove(i))).collect())
     }
 
-    /// Looks in the views without a hypothesis where the best one of the others would be seen.
+    /// Runs the network in the views without a hypothesis, where the best one of the others would appear.
     fn ask_other_views(&mut self, scene: &SearchScene<'_>) -> Result<(), TrackError> {
         let best = self.views.iter().enumerate().filter_map(|(slot, view)| Some((slot, &view.found.first()?.0)));
         let Some((slot, sighting)) = best.max_by(|a, b| a.1.score().total_cmp(&b.1.score())) else { return Ok(()) };
@@ -121,7 +124,7 @@ impl Search {
 }
 
 impl ViewSearch {
-    /// Looks at this view's foreground and at its next crops.
+    /// Runs the network on this view's foreground and its next crops.
     fn search(&mut self, scene: &SearchScene<'_>, slot: usize) -> Result<(), TrackError> {
         self.found.retain(|(_, nanos)| scene.nanos.saturating_sub(*nanos).abs() <= FORGET_NANOS);
         let Some(picture) = &scene.pictures[slot] else { return Ok(()) };
@@ -149,7 +152,7 @@ impl ViewSearch {
         Ok(())
     }
 
-    /// Keeps the person whom the network sees in a crop, after looking again at what it found.
+    /// Keeps the person whom the network finds in a crop, after two more runs on crops around the found landmarks.
     fn try_crop(
         &mut self,
         net: &PoseNet,
@@ -181,7 +184,7 @@ impl ViewSearch {
     }
 }
 
-/// Everybody the network finds in an image, best first.
+/// Returns all people whom the network finds in an image, best first.
 pub(crate) fn sightings(net: &PoseNet, picture: &Rgb, config: &PoseConfig) -> Result<Vec<Sighting>, TrackError> {
     let mut view = ViewSearch::default();
     for crop in search_crops(picture.width as u32, picture.height as u32) {
@@ -190,7 +193,7 @@ pub(crate) fn sightings(net: &PoseNet, picture: &Rgb, config: &PoseConfig) -> Re
     Ok(view.found.into_iter().map(|(sighting, _)| sighting).collect())
 }
 
-/// Squares around the largest pieces of foreground, without those of people who are tracked already.
+/// Returns squares around the largest pieces of foreground, except those of people who are tracked already.
 fn foreground_crops(evidence: &Grid, taken: &[[Option<DVec2>; LANDMARK_COUNT]]) -> Vec<Crop> {
     let (width, height) = (evidence.width, evidence.height);
     // A vote among neighbours removes specks.
@@ -232,7 +235,7 @@ fn foreground_crops(evidence: &Grid, taken: &[[Option<DVec2>; LANDMARK_COUNT]]) 
         .collect()
 }
 
-/// Index of the chosen hypothesis of each view.
+/// Returns the index of the chosen hypothesis of each view.
 fn choose(scene: &SearchScene<'_>, found: &[Vec<Sighting>]) -> Vec<Option<usize>> {
     let (cameras, config) = (scene.cameras, scene.config);
     let keypoints = |choice: &[Option<usize>]| -> Vec<Option<ViewKeypoints>> {
@@ -283,7 +286,7 @@ fn choose(scene: &SearchScene<'_>, found: &[Vec<Sighting>]) -> Vec<Option<usize>
     if best.0 > 0.0 {
         return best.1;
     }
-    // Nobody in two views: the best single sighting, if any.
+    // No person in two views: the best single sighting, if any.
     let single = (0..found.len()).filter(|&slot| !found[slot].is_empty());
     let single = single.max_by(|&a, &b| found[a][0].score().total_cmp(&found[b][0].score()));
     let mut choice = vec![None; found.len()];
@@ -293,14 +296,14 @@ fn choose(scene: &SearchScene<'_>, found: &[Vec<Sighting>]) -> Vec<Option<usize>
     choice
 }
 
-/// Mean distance of a person's landmarks from a place, metres.
+/// Returns the mean distance of a person's landmarks from a place, metres.
 fn distance_from(center: DVec3, points: &[Option<WorldPoint>; LANDMARK_COUNT]) -> f64 {
     let (sum, count) =
         points.iter().flatten().fold((DVec3::ZERO, 0.0), |(sum, count), point| (sum + point.position, count + 1.0));
     (sum / f64::max(count, 1.0)).distance(center)
 }
 
-/// Whether the trunk is there and as large as a person's.
+/// Whether the trunk is known and as long as a person's.
 fn human_size(points: &[Option<WorldPoint>; LANDMARK_COUNT]) -> bool {
     let count = points.iter().flatten().count();
     let lengths: Vec<f64> = [(11, 23), (12, 24)]
@@ -310,7 +313,7 @@ fn human_size(points: &[Option<WorldPoint>; LANDMARK_COUNT]) -> bool {
     count >= 8 && !lengths.is_empty() && lengths.iter().all(|l| (0.2..0.9).contains(l))
 }
 
-/// Where a camera sees world points; `None` where it does not.
+/// Projects world points to pixels of a camera; `None` where they are out of its view.
 pub(crate) fn project_all(camera: &Camera, points: &[DVec3; LANDMARK_COUNT]) -> [Option<DVec2>; LANDMARK_COUNT] {
     points.map(|point| camera.project(point))
 }
@@ -336,7 +339,7 @@ mod tests {
     }
 
     #[test]
-    fn foreground_is_looked_at_largest_first_and_without_people_who_are_known() {
+    fn foreground_is_tried_largest_first_and_without_people_who_are_known() {
         let crops = foreground_crops(&scene(), &[]);
         assert_eq!(crops.len(), 2);
         assert!(crops[0].center.distance(DVec2::new(84.5, 59.5)) < 1.5, "{:?}", crops[0]);
@@ -362,7 +365,7 @@ mod tests {
     }
 
     #[test]
-    fn the_person_nearest_to_what_the_cameras_look_at_is_chosen_whoever_is_larger() {
+    fn the_person_nearest_to_the_cameras_common_centre_is_chosen_even_if_smaller() {
         let rig = ring(3);
         let config = PoseConfig::default();
         let net = PoseNet::embedded().unwrap();
@@ -376,7 +379,7 @@ mod tests {
             taken: &[],
             config: &config,
         };
-        // The second one is nearer to the first camera, so larger in its image.
+        // The second person is nearer to the first camera, so larger in its image.
         for (people, nearest) in
             [([DVec3::ZERO, DVec3::new(0.9, 0.9, 0.0)], 0), ([DVec3::new(0.9, 0.9, 0.0), DVec3::new(0.1, 0.0, 0.0)], 1)]
         {

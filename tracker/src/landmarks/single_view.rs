@@ -1,4 +1,6 @@
-//! Depth from a single camera: joints by the network's guess, and the size of people who stand on the floor.
+//! Depth from a single camera: landmarks from the network's own estimate, and the height of people who stand on the floor.
+//!
+//! A single camera measures only a person's height, by where the feet stand.
 
 use flyrig_types::Camera;
 use glam::{DMat3, DVec2, DVec3, Vec3};
@@ -7,9 +9,9 @@ use crate::image::view::{View, observe};
 use crate::landmarks::keypoints::LANDMARK_COUNT;
 use crate::landmarks::sighting::Sighting;
 
-/// World points from one view: the network's hip-centred landmarks (in metres, for a trunk of half a
-/// metre; times `scale`), turned by the crop, moved to where they explain the image best (linear least squares).
-/// `None` when that place is behind the camera or not finite.
+/// Returns world points in metres from one view: the network's hip-centred landmarks (metres, for a trunk of half a metre, times
+/// `scale`), rotated as the crop, at the place where they explain the image best (linear least squares). `None` when that place is
+/// behind the camera or not finite.
 pub(crate) fn lift(
     camera: &Camera,
     sighting: &Sighting,
@@ -53,12 +55,12 @@ pub(crate) fn lift(
     }))
 }
 
-/// Share of the sets that may have feet in the air: these seem to stand farther away.
+/// Share of the frame sets in which the feet may be in the air, where the person seems to stand farther away.
 const IN_THE_AIR: f64 = 0.6;
 
-/// Returns how many times larger a person is than these bodies (world vertices, one body a set), which fill the person's part of a camera's
-/// images: bodies grow along the lines of sight until their lowest points meet a floor at a height along `up`. `None` where the camera does
-/// not look down on their feet.
+/// Returns the ratio of a person's size to that of bodies that fill the same pixels (world vertices in metres, one body per frame
+/// set): bodies grow along the lines of sight until their lowest points meet the floor at height `floor_m` along `up`. `None` unless
+/// the camera looks down on the feet.
 pub(crate) fn growth_to_floor(camera: &Camera, up: DVec3, floor_m: f64, bodies: &[Vec<Vec3>]) -> Option<f64> {
     let up = up.try_normalize()?;
     let above = |at: DVec3| at.dot(up) - floor_m;

@@ -16,7 +16,8 @@ use crate::landmarks::sighting::Sighting;
 use crate::network::pose_net::PoseNet;
 use crate::pose::body_model::BodyModel;
 
-/// Landmarks of lower confidence are guesses, and those farther from the body are another person's or on the wrong side, metres.
+/// Least confidence of a sure landmark, and largest distance from the body, metres: beyond, it is another person's or on the wrong
+/// side.
 const SURE: f64 = 0.3;
 const GROSS_M: f64 = 0.15;
 /// Upper ends of the ranges of confidence whose spread is measured.
@@ -25,8 +26,8 @@ const RANGES: [f64; 8] = [0.05, 0.1, 0.2, 0.3, 0.5, 0.7, 0.9, 1.0];
 const ROUNDS: usize = 20;
 const ROBUST_M: f64 = 0.03;
 
-/// One landmark seen in one view: derivative of its place in the image plane by its bias, and that place relative to the
-/// body's; metres at the body's depth.
+/// Observation of a landmark in one view: derivative of its place in the image plane by its bias, and that place relative to the
+/// body's, metres at the body's depth.
 #[derive(Debug, Clone, Copy)]
 struct Sample {
     rows: [DVec3; 2],
@@ -35,35 +36,35 @@ struct Sample {
 }
 
 impl Sample {
-    /// Squared distance from where a bias puts the landmark, square metres.
+    /// Returns the squared distance from the place that a bias predicts, square metres.
     fn square(&self, bias: DVec3) -> f64 {
         (self.error - DVec2::new(self.rows[0].dot(bias), self.rows[1].dot(bias))).length_squared()
     }
 
-    /// Whether the landmark is surely this one, and seen.
+    /// Whether the landmark is surely this one, and visible.
     fn is_sure(&self) -> bool {
         self.confidence >= SURE && self.error.length() <= GROSS_M
     }
 }
 
-/// Measures the network's bias and spread on people whose pose is known.
+/// Measurement of the network's bias and spread, on people whose pose is known.
 #[derive(Debug)]
 pub struct LandmarkStudy {
     net: PoseNet,
-    /// By landmark of the left side or the middle.
+    /// Samples of each landmark of the left side or the middle.
     samples: Vec<Vec<Sample>>,
 }
 
 /// Bias and spread of one landmark.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct LandmarkBias {
-    /// Number of the landmark; those of the right side count as their mirror images.
+    /// Index of the landmark; those of the right side count as their mirror images.
     pub landmark: usize,
-    /// From the anatomical place, canonical axes of the part that carries it, metres on a body of 1.7 m.
+    /// Offset from the anatomical place, canonical axes of the part that carries it, metres on a body of 1.7 m.
     pub bias_m: DVec3,
     /// Standard deviation about it in an image, metres at the body's depth.
     pub spread_m: f64,
-    /// How often it was seen.
+    /// Number of observations.
     pub count: usize,
 }
 
@@ -102,7 +103,7 @@ impl LandmarkStudy {
         Ok(())
     }
 
-    /// Returns the habits of all landmarks that were seen from enough directions.
+    /// Returns the biases of all landmarks that were seen from enough directions.
     #[must_use]
     pub fn biases(&self) -> Vec<LandmarkBias> {
         let fit = |(landmark, samples): (usize, &Vec<Sample>)| {
@@ -127,7 +128,7 @@ impl LandmarkStudy {
                 bias = normal.inverse() * right;
             }
             let mut squares: Vec<f64> = samples.iter().map(|sample| sample.square(bias)).collect();
-            // Of a two-dimensional Gaussian: the median square is 2 ln 2 variances.
+            // The median square of a two-dimensional Gaussian is 2 ln 2 variances.
             let spread_m = (flyrig_solve::median(&mut squares)? / (2.0 * std::f64::consts::LN_2)).sqrt();
             (bias.is_finite() && spread_m.is_finite()).then_some(LandmarkBias {
                 landmark,
@@ -139,7 +140,7 @@ impl LandmarkStudy {
         self.samples.iter().enumerate().filter_map(fit).collect()
     }
 
-    /// Returns how a landmark's spread grows as the network is less sure of it, by ranges of confidence from low to high.
+    /// Returns the growth of the spread with falling confidence, by ranges of confidence from low to high.
     #[must_use]
     pub fn spreads(&self) -> Vec<ConfidenceSpread> {
         let mut relative: [Vec<f64>; RANGES.len()] = Default::default();
@@ -168,9 +169,9 @@ impl LandmarkStudy {
 pub struct ConfidenceSpread {
     /// Upper end of the range, 0..=1.
     pub up_to: f64,
-    /// Distance that holds nine of ten, as a multiple of that of the surest range.
+    /// Distance within which 90 % lie, as a multiple of that of the surest range.
     pub times: f64,
-    /// How many there were.
+    /// Number of observations.
     pub count: usize,
 }
 

@@ -1,4 +1,4 @@
-//! Where BlazePose's landmarks lie on a template: joints, and places on the skin found by their geometry.
+//! Places of BlazePose's landmarks on a template: joints, and places on the skin found by their geometry.
 
 use flyrig_body::Template;
 use glam::DVec3;
@@ -10,7 +10,7 @@ use crate::landmarks::keypoints::{
 };
 use crate::pose::anatomy::Roles;
 
-/// A canonical point of the template that moves with one joint.
+/// Point of a template that moves with one joint; canonical space, metres.
 #[derive(Debug, Clone, Copy, PartialEq, Default)]
 pub(crate) struct BodyMark {
     pub joint: usize,
@@ -18,15 +18,19 @@ pub(crate) struct BodyMark {
 }
 
 impl BodyMark {
+    /// Returns a point that moves with a joint.
     fn on_joint(joint: usize, point: DVec3) -> Self {
         Self { joint, point }
     }
 }
 
-/// The landmarks' places on the template.
+/// Returns the landmarks' places on a template.
 ///
-/// Joints for shoulders, elbows, wrists, hips, knees, ankles; for the face, the hands and the feet places on
-/// the surface: the network was taught on images, where people click the skin.
+/// Shoulders, elbows, wrists, hips, knees and ankles are joints; landmarks of face, hands and feet are places on the surface, since
+/// the network was trained on images that people annotated on the skin.
+///
+/// # Errors
+/// Kind `Template` when head, feet or hands have no vertices.
 pub(crate) fn find_marks(
     template: &Template,
     roles: &Roles,
@@ -176,7 +180,7 @@ impl Body<'_> {
         let thumb_joint = (0..joints.len())
             .find(|&j| joints[j].name.to_ascii_lowercase().contains("thumb") && self.is_below(j, hand));
         let thumb: Vec<usize> = thumb_joint.map_or(Vec::new(), |joint| self.vertices_below(joint));
-        // The thumb stands off the row of fingers: without it the flesh tells the fingers' direction.
+        // The thumb stands off the row of fingers: without it the mean of the flesh gives the fingers' direction.
         let points: Vec<DVec3> =
             self.vertices_below(hand).into_iter().filter(|v| !thumb.contains(v)).map(|v| self.position(v)).collect();
         if points.is_empty() {

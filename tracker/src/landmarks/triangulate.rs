@@ -1,4 +1,4 @@
-//! Landmarks of several views to points in the world.
+//! Triangulation of landmarks of several views, robust against views that disagree.
 
 use flyrig_types::Camera;
 use glam::{DMat3, DVec2, DVec3};
@@ -6,26 +6,63 @@ use glam::{DMat3, DVec2, DVec3};
 use crate::image::view::{Observation, View, observe};
 use crate::landmarks::keypoints::{LANDMARK_COUNT, ViewKeypoints};
 
-/// Smallest angle between two rays that fixes a point, radians.
+/// Least angle between two rays that determine a point, radians.
 const MIN_PARALLAX: f64 = 0.03;
 
-/// A landmark in the world.
+/// Landmark in the world.
 #[derive(Debug, Clone, PartialEq)]
 pub struct WorldPoint {
-    /// Metres.
+    /// Place in the world, metres.
     pub position: DVec3,
-    /// Views that agree (rig slots).
+    /// Indices in the rig of the views that agree.
     pub inliers: Vec<usize>,
     /// Root mean square distance of the agreeing views, pixels of the undistorted image.
     pub residual_px: f64,
 }
 
-/// Triangulates every landmark that at least two views agree on: candidates from pairs of views, the one
-/// that most views agree with (within `inlier_m` at the point's depth) wins, Gauss-Newton in pixels with
-/// Cauchy weights polishes it.
+/// Triangulates every landmark that at least two views agree on.
 ///
-/// A slot a camera; cameras without landmarks are `None`. Unusable or doubtful landmarks are left out, so
-/// poisoned input gives fewer points, never a point that is not finite.
+/// Pairs of views give candidates; the one that most views agree with (within `inlier_m` metres at its depth) wins and is refined by
+/// Gauss-Newton on reprojection residuals with Cauchy weights. `keypoints` are in rig order, `None` for cameras without landmarks.
+/// Unusable landmarks and those below the threshold are ignored, so poisoned input gives fewer points, never one that is not finite.
+///
+/// ```
+/// use flyrig_tracker::{Keypoint, LANDMARK_COUNT, triangulate};
+/// use flyrig_types::{Camera, Intrinsics, Isometry, Lens};
+/// use glam::{DVec2, DVec3};
+///
+/// let camera = |id: &str, eye: DVec3| Camera {
+///     time_offset_nanos: 0,
+///     color: Default::default(),
+///     id: id.into(),
+///     intrinsics: Intrinsics {
+///         width: 640,
+///         height: 480,
+///         focal_px: DVec2::splat(500.0),
+///         center_px: DVec2::new(319.5, 239.5),
+///         lens: Lens::PINHOLE,
+///     },
+///     camera_from_world: Isometry::look_at(eye, DVec3::Z, DVec3::Z),
+/// };
+/// let cameras = [camera("left", DVec3::new(3.0, 0.0, 1.5)), camera("right", DVec3::new(0.0, 3.0, 1.5))];
+///
+/// // Both cameras see the nose (landmark 0), and nothing else.
+/// let nose = DVec3::new(0.1, -0.2, 1.6);
+/// let keypoints: Vec<_> = cameras
+///     .iter()
+///     .map(|camera| {
+///         let mut seen = [Keypoint::default(); LANDMARK_COUNT];
+///         seen[0] = Keypoint { pixel: camera.project(nose)?, confidence: 0.9 };
+///         Some(seen)
+///     })
+///     .collect();
+/// let points = triangulate(&cameras, &keypoints, 0.3, 0.05);
+/// let found = points[0].as_ref().ok_or("the views do not agree")?;
+/// assert!(found.position.distance(nose) < 1e-6);
+/// assert_eq!(found.inliers, [0, 1]);
+/// assert!(points[1].is_none());
+/// # Ok::<(), Box<dyn std::error::Error>>(())
+/// ```
 #[must_use]
 pub fn triangulate(
     cameras: &[Camera],
@@ -52,7 +89,7 @@ pub fn triangulate(
     })
 }
 
-/// One landmark, see [`triangulate`].
+/// Triangulates one landmark; see [`triangulate`].
 pub(crate) fn triangulate_point(views: &[View], seen: &[(usize, Observation)], inlier_m: f64) -> Option<WorldPoint> {
     let mut best: Option<(Vec<usize>, f64, DVec3)> = None;
     for a in 0..seen.len() {
@@ -89,17 +126,18 @@ pub(crate) fn triangulate_point(views: &[View], seen: &[(usize, Observation)], i
     })
 }
 
-/// Distance between a world point's pixel and the landmark, in metres at the point's depth.
+/// Returns the reprojection residual of a world point, metres at its depth.
 fn distance_m(view: &View, observation: &Observation, point: DVec3) -> Option<f64> {
     let pixel = view.project(point)?;
     Some((pixel - observation.ideal_px).length() / view.px_per_m(point)?)
 }
 
+/// Returns the world direction of an undistorted pixel.
 fn ray(view: &View, ideal_px: DVec2) -> DVec3 {
     (view.rotation.transpose() * (ideal_px / view.focal_px).extend(1.0)).normalize()
 }
 
-/// Middle of the shortest line between two rays.
+/// Returns the midpoint of the shortest line between two rays; `None` for nearly parallel rays and points behind a camera.
 fn intersect(views: &[View], a: &(usize, Observation), b: &(usize, Observation)) -> Option<DVec3> {
     let (view_a, view_b) = (&views[a.0], &views[b.0]);
     let (ray_a, ray_b) = (ray(view_a, a.1.ideal_px), ray(view_b, b.1.ideal_px));
@@ -116,7 +154,7 @@ fn intersect(views: &[View], a: &(usize, Observation), b: &(usize, Observation))
     (along_a > 0.0 && along_b > 0.0 && point.is_finite()).then_some(point)
 }
 
-/// Gauss-Newton on reprojection distances with Cauchy weights.
+/// Refines a point by Gauss-Newton on reprojection residuals with Cauchy weights.
 fn polish(views: &[View], seen: &[(usize, Observation)], start: DVec3, inlier_m: f64) -> DVec3 {
     let mut point = start;
     for _ in 0..5 {

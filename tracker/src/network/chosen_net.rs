@@ -1,4 +1,4 @@
-//! A landmark network of the user's choice.
+//! A landmark network of the user's choice: input in its format, landmarks from points, heatmaps or SimCC bins (Li et al. 2022).
 
 use std::path::Path;
 use std::sync::Arc;
@@ -16,7 +16,7 @@ use crate::network::output::{CropLandmark, NetOutput};
 /// Landmarks of one run: pixels of the input, centre of the first pixel at 0, and confidence; by index in the output.
 type Points = Vec<(DVec2, f64)>;
 
-/// A network that a [`NetworkFile`] describes.
+/// Network that a [`NetworkFile`] describes.
 #[derive(Clone)]
 pub(crate) struct ChosenNet {
     net: LandmarkNet,
@@ -24,7 +24,7 @@ pub(crate) struct ChosenNet {
     size: [usize; 2],
     channels_first: bool,
     file: Arc<NetworkFile>,
-    /// Index in the output by body landmark.
+    /// Index of each body landmark in the output.
     indices: [Option<usize>; LANDMARK_COUNT],
 }
 
@@ -38,6 +38,10 @@ impl ChosenNet {
         Self::new(file, &onnx)
     }
 
+    /// Loads the network of a description from the bytes of its ONNX file, and runs it once.
+    ///
+    /// # Errors
+    /// Kind [`crate::TrackErrorKind::Net`] names the file and what is wrong with it.
     pub fn new(file: NetworkFile, onnx: &[u8]) -> Result<Self, TrackError> {
         let name = file.file.display().to_string();
         let mut chosen = None;
@@ -55,7 +59,7 @@ impl ChosenNet {
         Ok(chosen)
     }
 
-    /// Looks at the person in a square of an image. The input may be wider or higher than the square.
+    /// Runs the network on a square of an image. The input may be wider or higher than the square.
     ///
     /// # Errors
     /// Kind [`crate::TrackErrorKind::Net`] when the network fails, or an output is missing or not finite.
@@ -72,7 +76,7 @@ impl ChosenNet {
             Some(CropLandmark { x, y, confidence, world: None })
         };
         let landmarks = self.indices.map(|index| landmark(index).unwrap_or(CropLandmark::UNSEEN));
-        // Half of the landmarks may be hidden, or out of the image.
+        // Presence is the mean of the better half: the others may be hidden, or out of the image.
         let mut confidences: Vec<f64> =
             self.indices.iter().zip(&landmarks).filter_map(|(index, seen)| index.map(|_| seen.confidence)).collect();
         confidences.sort_by(|a, b| b.total_cmp(a));
@@ -81,7 +85,7 @@ impl ChosenNet {
         Ok(NetOutput { landmarks, presence, mask: None })
     }
 
-    /// The network's numbers of a square of RGB in 0..=1, without a margin left and right, or above and below.
+    /// Returns the network's input from a square of RGB in 0..=1, cut by a margin left and right, or above and below.
     fn input(&self, rgb: &[f32], side: usize, margin: [usize; 2]) -> Vec<f32> {
         let [width, height] = self.size;
         let NetworkFile { mean, deviation, channels, .. } = &*self.file;
@@ -100,6 +104,7 @@ impl ChosenNet {
         }
     }
 
+    /// Runs the network and decodes its landmarks.
     fn points(&self, input: &[f32]) -> Result<Points, TrackError> {
         let outputs = self.net.run(input)?.all()?;
         let outputs: Vec<Array> = outputs.iter().map(|(shape, values)| Array { shape, values }).collect();
@@ -122,7 +127,7 @@ impl ChosenNet {
     }
 }
 
-/// Width, height and order of an input of an image in one of the usual orders.
+/// Returns width, height and whether channels come first, of an input in one of the usual orders.
 fn input(sides: &[Option<usize>], given: Option<[usize; 2]>) -> Result<([usize; 2], bool), String> {
     let (height, width, channels_first) = match *sides {
         [_, Some(3), height, width] => (height, width, true),
@@ -143,23 +148,23 @@ fn input(sides: &[Option<usize>], given: Option<[usize; 2]>) -> Result<([usize; 
     }
 }
 
-/// An output.
+/// Output of the network.
 struct Array<'a> {
     shape: &'a [usize],
     values: &'a [f32],
 }
 
 impl Array<'_> {
-    /// Its rows, of the last side's length; none of an array without a side.
+    /// Iterates over the rows, which are as long as the last side.
     fn rows(&self) -> impl ExactSizeIterator<Item = &[f32]> {
         self.values.chunks_exact(self.shape.last().copied().unwrap_or(1).max(1))
     }
 }
 
-/// Landmarks that are some numbers each.
+/// Decodes landmarks that are a few numbers each.
 fn points(outputs: &[Array<'_>], count: usize, file: &NetworkFile, [width, height]: [usize; 2]) -> Option<Points> {
     let numbers = file.point.len();
-    // Several may fit: an array whose rows are landmarks comes first, then the smallest.
+    // Several outputs may fit: an array whose rows are landmarks is preferred, then the smallest.
     let fits = |output: &&Array| output.values.len().is_multiple_of(numbers) && output.values.len() / numbers >= count;
     let output = outputs
         .iter()
@@ -185,7 +190,7 @@ fn points(outputs: &[Array<'_>], count: usize, file: &NetworkFile, [width, heigh
     Some(output.values.chunks_exact(numbers).map(point).collect())
 }
 
-/// The brightest places of an image a landmark; its brightness is the confidence.
+/// Decodes one heatmap per landmark: the place of its peak, with the height as confidence.
 fn heatmaps(outputs: &[Array<'_>], count: usize, size: [usize; 2]) -> Option<Points> {
     let output = outputs.iter().find(|output| matches!(output.shape, [1, maps, _, _] if *maps >= count))?;
     let &[_, _, rows, columns] = output.shape else { return None };
@@ -202,7 +207,7 @@ fn heatmaps(outputs: &[Array<'_>], count: usize, size: [usize; 2]) -> Option<Poi
     output.values.chunks_exact((rows * columns).max(1)).map(peak).collect()
 }
 
-/// The highest bins along x and y; the lower one of the two heights is the confidence.
+/// Decodes the peaks of bins along x and y; the lower of the two heights is the confidence.
 fn simcc(outputs: &[Array<'_>], count: usize, [width, height]: [usize; 2]) -> Option<Points> {
     let axis = |output: &&Array, side: usize| matches!(output.shape, [1, landmarks, bins] if *landmarks >= count && bins.is_multiple_of(side) && *bins > 0);
     // Square inputs have two outputs of one shape, x first.
@@ -222,11 +227,12 @@ fn simcc(outputs: &[Array<'_>], count: usize, [width, height]: [usize; 2]) -> Op
     .collect()
 }
 
+/// Returns index and value of the largest number.
 fn highest(values: &[f32]) -> Option<(usize, f32)> {
     values.iter().copied().enumerate().max_by(|a, b| a.1.total_cmp(&b.1))
 }
 
-/// Place of the peak of a parabola through three neighbouring values, from the middle one, -0.5..=0.5.
+/// Returns the offset of the peak of a parabola through three neighbouring values from the middle one, -0.5..=0.5.
 fn between(before: Option<f32>, value: f32, after: Option<f32>) -> f64 {
     let (Some(before), Some(after)) = (before, after) else { return 0.0 };
     let bend = f64::from(before) + f64::from(after) - 2.0 * f64::from(value);

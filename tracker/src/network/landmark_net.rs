@@ -1,4 +1,8 @@
-//! Networks on one image through tract: loading, running and checking of outputs.
+//! Loads, runs and checks networks that take one crop of an image, through tract.
+//!
+//! Two operations of the loaded network are replaced: bilinear doublings (tract's own is slow, see
+//! [`upsample`](crate::network::upsample)) and the state of the vector registers after products
+//! ([`vector_state`](crate::network::vector_state)).
 
 use std::sync::Arc;
 
@@ -10,13 +14,13 @@ use crate::error::{TrackError, TrackErrorKind};
 use crate::network::upsample::replace_doublings;
 use crate::network::vector_state::{clear_after_products, clear_upper_halves};
 
-/// A network that takes one crop of an image.
+/// Network that takes one crop of an image.
 #[derive(Clone)]
 pub(crate) struct LandmarkNet {
     model: Arc<TypedRunnableModel>,
-    /// Shape of the input: an image, and its rows, columns and channels in the network's order.
+    /// Shape of the input: batch of 1, then rows, columns and channels in the network's order.
     shape: [usize; 4],
-    /// Name in messages: "pose", "hand", "face", or that of a file.
+    /// Name in error messages: "pose", "hand", "face", or that of a file.
     name: Arc<str>,
 }
 
@@ -33,7 +37,7 @@ impl LandmarkNet {
         })
     }
 
-    /// Loads an ONNX file whose input has the shape that `shape` chooses, given the sides that the file leaves open as `None`.
+    /// Loads an ONNX file. `shape` chooses the shape of the input from its sides; those that the file leaves open are `None`.
     ///
     /// # Errors
     /// Kind [`TrackErrorKind::Net`] when the file does not load, or with the message of `shape`.
@@ -72,8 +76,8 @@ impl LandmarkNet {
     pub fn run(&self, crop: &[f32]) -> Result<NetOutputs, TrackError> {
         let failed = |error: TractError| self.failed(&format!("failed: {error:#}"));
         let input = Tensor::from_shape(&self.shape, crop).map_err(failed)?;
-        // All cores share the products. Not so on one of rayon's threads: while it waits for another one's share it would take up
-        // other work, and tract panics where that is another run.
+        // All cores share the products, except on one of rayon's threads: while such a thread waits for the others' share it would
+        // pick up other work, and tract panics where that is another run.
         let is_of_pool = rayon::current_thread_index().is_some();
         let executor = if is_of_pool { Executor::SingleThread } else { Executor::RayonGlobal };
         let outputs = multithread_tract_scope(executor, || self.model.run(tvec!(input.into())));
@@ -85,18 +89,18 @@ impl LandmarkNet {
         Ok(NetOutputs { net: self.clone(), outputs })
     }
 
-    /// Zeros in the size of a crop.
+    /// Returns zeros in the size of a crop.
     pub fn blank(&self) -> Vec<f32> {
         vec![0.0; self.shape.iter().product()]
     }
 
-    /// Returns an error of this network.
+    /// Creates an error that names this network.
     pub fn failed(&self, message: &str) -> TrackError {
         TrackError::new(TrackErrorKind::Net, format!("the {} network {message}", self.name))
     }
 }
 
-/// Shape of an output, and its numbers row by row.
+/// Shape of an output and its numbers, row by row.
 pub(crate) type ShapedNumbers = (Vec<usize>, Vec<f32>);
 
 /// Outputs of one run.
@@ -106,10 +110,10 @@ pub(crate) struct NetOutputs {
 }
 
 impl NetOutputs {
-    /// Returns the output of a size.
+    /// Returns the output of `count` numbers.
     ///
     /// # Errors
-    /// Kind [`TrackErrorKind::Net`] when there is none or a number is not finite.
+    /// Kind [`TrackErrorKind::Net`] when there is no such output or a number is not finite.
     pub fn of_size(&self, count: usize) -> Result<Vec<f32>, TrackError> {
         let output = self.outputs.iter().find(|output| output.len() == count).ok_or_else(|| {
             self.net.failed(&format!("has no output of {count} numbers; use a file that convert_mediapipe.py made"))
@@ -125,6 +129,7 @@ impl NetOutputs {
         self.outputs.iter().map(|output| Ok((output.shape().to_vec(), self.numbers(output)?))).collect()
     }
 
+    /// Returns the numbers of an output, all finite.
     fn numbers(&self, output: &TValue) -> Result<Vec<f32>, TrackError> {
         let values =
             output.to_plain_array_view::<f32>().map_err(|error| self.net.failed(&format!("failed: {error:#}")))?;
@@ -137,7 +142,7 @@ impl NetOutputs {
     }
 }
 
-/// Probability of a logit.
+/// Returns the probability of a logit.
 pub(crate) fn sigmoid(logit: f64) -> f64 {
     1.0 / (1.0 + (-logit).exp())
 }

@@ -8,14 +8,14 @@ use serde::Deserialize;
 use crate::error::{TrackError, TrackErrorKind};
 use crate::landmarks::keypoints::{LANDMARK_COUNT, LANDMARK_NAMES, LEFT_HIP, LEFT_SHOULDER, RIGHT_HIP, RIGHT_SHOULDER};
 
-/// Landmarks that a network has to give at least, beside hips and shoulders.
+/// Least number of landmarks of a network; hips and shoulders must be among them.
 const LEAST_LANDMARKS: usize = 8;
 /// Longest side of an input, pixels.
 const LONGEST_SIDE: usize = 1024;
 /// Largest ONNX file, bytes.
 const MOST_BYTES: u64 = 1 << 30;
 
-/// How a network takes images and gives landmarks.
+/// Description of a network: format of its input, and form and names of its landmarks.
 #[derive(Debug, Clone, PartialEq, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub(crate) struct NetworkFile {
@@ -26,21 +26,21 @@ pub(crate) struct NetworkFile {
     /// Order of the input's channels.
     #[serde(default)]
     pub channels: Channels,
-    /// Mean of each channel, taken off the bytes 0 to 255, in the order of the channels.
+    /// Mean of each channel, subtracted from the bytes 0 to 255, in the order of the channels.
     #[serde(default)]
     pub mean: [f32; 3],
-    /// Divisor of each channel, after the mean is taken off.
+    /// Divisor of each channel after the mean is subtracted.
     #[serde(default = "bytes")]
     pub deviation: [f32; 3],
     /// Form of the output.
     pub output: OutputForm,
-    /// Meaning of each number of a landmark, where the output holds points.
+    /// Meaning of each number of a landmark in an output of points.
     #[serde(default = "xy_confidence")]
     pub point: Vec<PointValue>,
     /// Unit of those points.
     #[serde(default)]
     pub unit: Unit,
-    /// Confidence that counts as certain.
+    /// Value of the confidence that counts as certain.
     #[serde(default = "one")]
     pub certain: f64,
     /// Index of each landmark in the output, by its name.
@@ -60,15 +60,15 @@ pub(crate) enum Channels {
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Deserialize)]
 #[serde(rename_all = "lowercase")]
 pub(crate) enum OutputForm {
-    /// One array of landmarks, some numbers each.
+    /// One array of landmarks, a few numbers each.
     Points,
-    /// An image a landmark, brightest where it is.
+    /// One heatmap per landmark, with its peak at the landmark.
     Heatmaps,
-    /// A row of bins along x and one along y, highest where the landmark is (SimCC, Li et al. 2022).
+    /// One row of bins along x and one along y per landmark, with their peaks at the landmark (SimCC, Li et al. 2022).
     Simcc,
 }
 
-/// A number of a point.
+/// Meaning of one number of a point.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Deserialize)]
 #[serde(rename_all = "lowercase")]
 pub(crate) enum PointValue {
@@ -93,6 +93,7 @@ pub(crate) enum Unit {
     Share,
 }
 
+/// Returns the default divisors, which map bytes to 0..=1.
 fn bytes() -> [f32; 3] {
     [255.0; 3]
 }
@@ -134,6 +135,7 @@ impl NetworkFile {
         Ok(described)
     }
 
+    /// Checks ranges and names.
     fn check(&self) -> Result<(), String> {
         let sides = self.input.unwrap_or([1, 1]);
         if sides.iter().any(|side| !(1..=LONGEST_SIDE).contains(side)) {
@@ -166,7 +168,7 @@ impl NetworkFile {
         Ok(())
     }
 
-    /// Index of each body landmark in the output.
+    /// Returns the index of each body landmark in the output.
     pub fn indices(&self) -> Result<[Option<usize>; LANDMARK_COUNT], String> {
         let mut indices = [None; LANDMARK_COUNT];
         for (name, index) in &self.landmarks {

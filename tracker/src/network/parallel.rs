@@ -1,12 +1,14 @@
-//! Runs of a network beside each other.
+//! Parallel runs of a network in several views.
 
 use rayon::prelude::*;
 
-/// Returns `work` of every index below `count`. Where there are two cores and more for each, all run at once on threads of their own, and
-/// their networks' products share the cores ([`crate::landmark_net::LandmarkNet::run`]). Else as many as there are cores run beside each
-/// other, each on one of rayon's threads, where a network works alone; the few that are left over run one after the other on this
-/// thread, each with all cores.
-pub(crate) fn beside_each_other<T: Send>(count: usize, work: impl Fn(usize) -> T + Sync + Send) -> Vec<T> {
+/// Returns `work` of every index below `count`, in order.
+///
+/// With two or more cores per run, all run at once on threads of their own, and their networks' products share the cores
+/// ([`LandmarkNet::run`](crate::network::landmark_net::LandmarkNet::run)). Otherwise as many as there are cores run in parallel on
+/// rayon's threads, where a network uses a single core; the few that are left over run in sequence on this thread, each on all
+/// cores.
+pub(crate) fn map_parallel<T: Send>(count: usize, work: impl Fn(usize) -> T + Sync + Send) -> Vec<T> {
     let threads = rayon::current_num_threads().max(1);
     if count > 1 && threads >= 2 * count && rayon::current_thread_index().is_none() {
         return on_own_threads(count, &work);
@@ -39,8 +41,8 @@ mod tests {
         let square = |at: usize| at * at;
         for count in [0, 1, 2, 7, 100] {
             let expected: Vec<usize> = (0..count).map(square).collect();
-            assert_eq!(beside_each_other(count, square), expected);
-            let (inside, _) = rayon::join(|| beside_each_other(count, square), || ());
+            assert_eq!(map_parallel(count, square), expected);
+            let (inside, _) = rayon::join(|| map_parallel(count, square), || ());
             assert_eq!(inside, expected);
             assert_eq!(on_own_threads(count, &square), expected);
         }

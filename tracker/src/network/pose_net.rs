@@ -1,4 +1,4 @@
-//! The landmark network: BlazePose, or one of the user's choice.
+//! The pose network: BlazePose (Bazarevsky et al. 2020), or one of the user's choice.
 
 use std::path::Path;
 
@@ -10,15 +10,15 @@ use crate::network::chosen_net::ChosenNet;
 use crate::network::landmark_net::{LandmarkNet, sigmoid};
 use crate::network::output::{CropLandmark, NET_SIDE, NetOutput};
 
-/// Floats a landmark takes in the network's output.
+/// Floats per landmark in BlazePose's output.
 const LANDMARK_STRIDE: usize = 5;
-/// Landmarks the network gives: 33 of the body, 6 helpers of the original's tracking that we do not use.
+/// Landmarks of BlazePose: 33 of the body, and 6 helpers of the original's tracking that are not used.
 const NET_LANDMARKS: usize = 39;
 
 static EMBEDDED: &[u8] = include_bytes!("../../assets/pose_full.onnx");
 
-/// A landmark network: the one built in (BlazePose full, Bazarevsky et al. 2020; licence beside the file in `assets`), or one of
-/// the user's choice.
+/// Network that finds a person's landmarks: the one built in (BlazePose full; licence beside the file in `assets`), or one of the
+/// user's choice.
 #[derive(Clone)]
 pub struct PoseNet {
     kind: Kind,
@@ -37,7 +37,7 @@ impl std::fmt::Debug for PoseNet {
 }
 
 impl PoseNet {
-    /// The network built into this crate. Takes a few hundred milliseconds; clone it instead of loading it twice.
+    /// Loads the network built into this crate. Takes a few hundred milliseconds; clone it instead of loading it twice.
     ///
     /// # Errors
     /// Kind [`crate::TrackErrorKind::Net`] when the file does not load.
@@ -45,7 +45,7 @@ impl PoseNet {
         Self::from_onnx(EMBEDDED)
     }
 
-    /// A network from the bytes of an ONNX file with BlazePose's outputs (told apart by their sizes).
+    /// Loads a network from the bytes of an ONNX file with BlazePose's outputs, which are identified by their sizes.
     ///
     /// # Errors
     /// Kind [`crate::TrackErrorKind::Net`] when the file does not load or has other inputs or outputs.
@@ -55,7 +55,7 @@ impl PoseNet {
         Ok(Self { kind: Kind::BlazePose(net) })
     }
 
-    /// A network of the user's choice, from a TOML file that describes it (docs/guide/people.md).
+    /// Loads a network of the user's choice from a TOML file that describes it (docs/guide/people.md).
     ///
     /// # Errors
     /// Kind [`crate::TrackErrorKind::Net`] names the file, and the key where one is wrong.
@@ -63,13 +63,13 @@ impl PoseNet {
         Ok(Self { kind: Kind::Chosen(Box::new(ChosenNet::read(path)?)) })
     }
 
-    /// Whether outputs hold a mask and the landmarks' depth.
+    /// Whether outputs hold a mask and the depth of landmarks.
     #[must_use]
     pub fn sees_depth(&self) -> bool {
         matches!(self.kind, Kind::BlazePose(_))
     }
 
-    /// Looks at the person in a square of an image.
+    /// Runs the network on a square of an image.
     ///
     /// # Errors
     /// Kind [`crate::TrackErrorKind::Net`] when the network fails, or an output is missing or not finite.
@@ -81,7 +81,7 @@ impl PoseNet {
     }
 }
 
-/// Runs one crop: 256 x 256 x 3 RGB in 0..=1, row by row.
+/// Runs BlazePose on a crop of 256 x 256 x 3 values, RGB in 0..=1, row by row.
 fn run_blazepose(net: &LandmarkNet, rgb: &[f32]) -> Result<NetOutput, TrackError> {
     let outputs = net.run(rgb)?;
     let find = |count| outputs.of_size(count);

@@ -1,10 +1,11 @@
-//! Bilinear doubling of a network's grids: tract's own operator goes along a row element by element.
+//! Bilinear doubling of a network's grids, row by row: tract's own operator computes element by element.
 
 use tract_onnx::prelude::*;
 use tract_onnx::tract_core::internal::*;
 use tract_onnx::tract_core::ops::nn::resize::{CoordTransformer, Interpolator, Resize};
 
-/// Doubles the last two axes of an `f32` tensor; pixel centres at half-integers ("half_pixel" of ONNX), borders repeat.
+/// Operator that doubles the last two axes of an `f32` tensor; pixel centres at half-integers ("half_pixel" of ONNX), borders
+/// repeat.
 #[derive(Debug, Clone, Hash, PartialEq, Eq)]
 struct Upsample;
 
@@ -28,7 +29,7 @@ pub(crate) fn replace_doublings(model: &mut TypedModel) -> TractResult<()> {
     Ok(())
 }
 
-/// Doubles the width of a row. `out` is twice as long as `row`.
+/// Writes a row at twice its width; `out` is twice as long as `row`.
 fn double_row(row: &[f32], out: &mut [f32]) {
     let Some((first, last)) = row.first().zip(row.last()) else { return };
     let [left_end, between @ .., right_end] = out else { return };

@@ -1,8 +1,8 @@
-//! State of the vector registers after a network's products.
+//! Clears the vector registers after a network's products.
 //!
 //! tract's products (0.23, written in assembly) return without `vzeroupper`. The upper halves of the vector registers then still
-//! hold something, and on x86 processors every SSE instruction of the thread must merge with them until somebody clears them: box
-//! means ran 3.5 times slower on threads that had run a network.
+//! are in use, and on x86 processors every SSE instruction of the thread must merge with them until they are cleared: box means ran
+//! 3.5 times slower on threads that had run a network.
 
 use tract_onnx::prelude::*;
 use tract_onnx::tract_core::internal::*;
@@ -16,11 +16,11 @@ pub(crate) fn clear_upper_halves() {
     }
 }
 
-/// Hands a tensor on as it is, after [`clear_upper_halves`].
+/// Operator that passes a tensor on unchanged, after [`clear_upper_halves`].
 #[derive(Debug, Clone, Hash, PartialEq, Eq)]
 struct ClearUpperHalves;
 
-/// Clears them after each product of an optimised network, for the operators between the products.
+/// Inserts a [`ClearUpperHalves`] after each product of an optimised network, for the operators between the products.
 pub(crate) fn clear_after_products(model: &mut TypedModel) -> TractResult<()> {
     for id in 0..model.nodes.len() {
         if model.node(id).op_is::<OptMatMul>() {

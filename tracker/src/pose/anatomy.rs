@@ -1,11 +1,11 @@
-//! Which joint of a skeleton is which part of a human, and how far it turns.
+//! Joints of a skeleton by their role in the human body, found by name, and the ranges in which they turn.
 
 use flyrig_body::Skeleton;
 use glam::{DMat3, DVec3};
 
 use crate::error::{TrackError, TrackErrorKind};
 
-/// Joints that the fit must know; sides are left, right.
+/// Joints by role; pairs are left, right.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub(crate) struct Roles {
     pub hips: usize,
@@ -19,7 +19,7 @@ pub(crate) struct Roles {
     pub foot: [usize; 2],
 }
 
-/// Accepted names, lower case without separators and namespace; `*` stands for left/l, right/r.
+/// Accepted names in lower case without separators and namespace; `*` stands for left/l, right/r.
 const HIPS: &[&str] = &["hips", "pelvis", "root"];
 const HEAD: &[&str] = &["head"];
 const CLAVICLE: &[&str] = &["*shoulder", "*collar", "*clavicle", "clavicle*"];
@@ -31,6 +31,10 @@ const SHANK: &[&str] = &["*leg", "*lowerleg", "*shin", "*calf", "calf*", "*knee"
 const FOOT: &[&str] = &["*foot", "foot*", "*ankle"];
 
 impl Roles {
+    /// Finds the joints by their names.
+    ///
+    /// # Errors
+    /// Kind `Template` names the missing joint and accepted names.
     pub fn find(skeleton: &Skeleton, template: &str) -> Result<Self, TrackError> {
         let names: Vec<String> = skeleton
             .joints()
@@ -82,7 +86,7 @@ impl Roles {
     }
 }
 
-/// How a joint turns away from the bind pose: limits and a pull on the components of its rotation vector.
+/// Range of a joint's rotation away from the bind pose: limits and standard deviations of the components of its rotation vector.
 #[derive(Debug, Clone, PartialEq)]
 pub(crate) struct JointRange {
     /// Columns: flexion axis, twist axis, third axis; canonical axes.
@@ -95,7 +99,7 @@ pub(crate) struct JointRange {
     pub sigma: DVec3,
 }
 
-/// The ranges of all joints; `None` for a joint that does not turn (fingers, joints without a role in the pose).
+/// Returns the ranges of all joints; `None` for joints that do not turn (fingers, joints without a role in the pose).
 pub(crate) fn joint_ranges(skeleton: &Skeleton, roles: &Roles, origins: &[DVec3]) -> Vec<Option<JointRange>> {
     let mut ranges: Vec<Option<JointRange>> = vec![None; origins.len()];
     let symmetric = |axes, limit: [f64; 3], sigma: [f64; 3]| {
@@ -131,7 +135,7 @@ pub(crate) fn joint_ranges(skeleton: &Skeleton, roles: &Roles, origins: &[DVec3]
         let [hip, knee, ankle] = [roles.thigh[side], roles.shank[side], roles.foot[side]];
         let upper = (origins[elbow] - origins[arm]).normalize_or(DVec3::X * sign);
         let lower = (origins[wrist] - origins[elbow]).normalize_or(upper);
-        // The elbow may be bent at rest; then the bend tells its axis.
+        // The elbow may be bent at rest; the bend then gives its axis.
         let bent = upper.cross(lower);
         let forward = upper.cross(DVec3::Z).normalize_or(DVec3::NEG_Y * sign);
         let elbow_axis = if bent.length() > 0.17 { bent.normalize() } else { forward };

@@ -1,6 +1,6 @@
-//! A template's skeleton as the fit sees it: turns away from the bind pose, in canonical axes.
+//! A template's skeleton as the solver sees it: rotations away from the bind pose, in canonical axes.
 //!
-//! With `G_j` the rotation that takes joint j's flesh from canonical axes to the world, the parameters are
+//! With `G_j` the rotation of joint j's flesh from canonical axes to the world, the parameters are
 //! `A_j = G_parent⁻¹ G_j`: identity in the bind pose for every joint, in axes that mean the same for every
 //! skeleton (x left, y up, z forward).
 
@@ -14,20 +14,21 @@ use crate::landmarks::keypoints::{LANDMARK_COUNT, LEFT_HIP, LEFT_SHOULDER, RIGHT
 use crate::landmarks::surface_marks::{BodyMark, find_marks};
 use crate::pose::anatomy::{JointRange, Roles, joint_ranges};
 
-/// JointTurns of all joints and the root's place.
+/// Rotations of all joints and the root's place in the world.
 #[derive(Debug, Clone, PartialEq)]
 pub(crate) struct JointTurns {
+    /// Origin of the root joint, world metres.
     pub root: DVec3,
     /// `A_j`; for the root `G_root`.
     pub turns: Vec<DQuat>,
 }
 
 impl JointTurns {
-    /// Continues the motion from `before` to here by a share of it.
+    /// Extrapolates the motion from `before` to here by a share of it.
     pub fn advanced(&self, before: &Self, share: f64) -> Self {
         let turn = |(now, before): (&DQuat, &DQuat)| {
             let change = (*now * before.inverse()).normalize();
-            // The shorter way round.
+            // Takes the shorter way round.
             let change = if change.w < 0.0 { -change } else { change };
             (DQuat::from_scaled_axis(change.to_scaled_axis() * share) * *now).normalize()
         };
@@ -38,24 +39,24 @@ impl JointTurns {
     }
 }
 
-/// World state of a skeleton.
+/// Skeleton in the world.
 #[derive(Debug, Clone)]
 pub(crate) struct PosedSkeleton {
     /// `G_j`.
     pub rotation: Vec<DQuat>,
-    /// Joint origins.
+    /// Joint origins, metres.
     pub origin: Vec<DVec3>,
 }
 
-/// What the fit needs of a template.
+/// Skeleton of a template with roles, ranges and landmarks.
 #[derive(Debug, Clone)]
 pub(crate) struct BodyModel {
     pub parents: Vec<Option<usize>>,
     /// Rotation of `canonical_from_joint`.
     pub bind_rotation: Vec<DQuat>,
-    /// Joint origin in canonical space.
+    /// Joint origins in canonical space, metres.
     pub origins: Vec<DVec3>,
-    /// Joint origin from its parent's, canonical axes.
+    /// Joint origins relative to their parents', canonical axes, metres.
     pub offsets: Vec<DVec3>,
     pub roles: Roles,
     pub ranges: Vec<Option<JointRange>>,
@@ -63,14 +64,20 @@ pub(crate) struct BodyModel {
 }
 
 impl BodyModel {
-    /// With the landmarks where the network points.
+    /// Reads a template, with landmarks at the biased places where the network finds them.
+    ///
+    /// # Errors
+    /// Kind `Template` when joints or skin are missing or not finite.
     pub fn new(template: &Template) -> Result<Self, TrackError> {
         let mut model = Self::with_anatomical_marks(template)?;
         add_biases(template, &mut model.marks);
         Ok(model)
     }
 
-    /// With the landmarks at their anatomical places.
+    /// Reads a template, with landmarks at their anatomical places.
+    ///
+    /// # Errors
+    /// Those of [`Self::new`].
     pub fn with_anatomical_marks(template: &Template) -> Result<Self, TrackError> {
         let joints = template.skeleton.joints();
         let roles = Roles::find(&template.skeleton, &template.name)?;
@@ -99,12 +106,12 @@ impl BodyModel {
         Ok(Self { parents, bind_rotation, origins, offsets, roles, ranges, marks })
     }
 
-    /// The bind pose with the root joint at a place.
+    /// Returns the bind pose with the root joint at a place, world metres.
     pub fn bind_turns(&self, root: DVec3) -> JointTurns {
         JointTurns { root, turns: vec![DQuat::IDENTITY; self.parents.len()] }
     }
 
-    /// Forward kinematics.
+    /// Computes forward kinematics.
     pub fn pose(&self, turns: &JointTurns) -> PosedSkeleton {
         let mut posed = PosedSkeleton { rotation: Vec::with_capacity(self.parents.len()), origin: Vec::new() };
         for (joint, parent) in self.parents.iter().enumerate() {
@@ -121,19 +128,19 @@ impl BodyModel {
         posed
     }
 
-    /// World position of a mark.
+    /// Returns the world position of a landmark, metres.
     pub fn mark(&self, posed: &PosedSkeleton, landmark: usize) -> DVec3 {
         let mark = &self.marks[landmark];
         posed.origin[mark.joint] + posed.rotation[mark.joint] * (mark.point - self.origins[mark.joint])
     }
 
-    /// World positions of all marks.
+    /// Returns the world positions of all landmarks, metres.
     pub fn marks(&self, turns: &JointTurns) -> [DVec3; LANDMARK_COUNT] {
         let posed = self.pose(turns);
         std::array::from_fn(|i| self.mark(&posed, i))
     }
 
-    /// As the workspace's pose.
+    /// Converts to a pose of the template's skeleton.
     pub fn to_pose(&self, turns: &JointTurns) -> Pose {
         let rotations = self.parents.iter().enumerate().map(|(joint, parent)| {
             let bind = self.bind_rotation[joint];
@@ -146,7 +153,7 @@ impl BodyModel {
         Pose { root_translation: turns.root, joint_rotations: rotations.collect() }
     }
 
-    /// From the workspace's pose; `None` when it does not fit the skeleton or is not finite.
+    /// Converts from a pose of the template's skeleton; `None` when it does not fit the skeleton or is not finite.
     pub fn to_turns(&self, pose: &Pose) -> Option<JointTurns> {
         if !pose.is_valid() || pose.joint_rotations.len() != self.parents.len() {
             return None;
@@ -163,7 +170,7 @@ impl BodyModel {
         Some(JointTurns { root: pose.root_translation, turns: turns.collect() })
     }
 
-    /// Middle of the hips to middle of the shoulders, metres.
+    /// Returns the distance from the middle of the hips to the middle of the shoulders, metres.
     pub fn trunk_length(&self) -> f64 {
         let at = |i: usize| self.marks[i].point;
         (0.5 * (at(LEFT_SHOULDER) + at(RIGHT_SHOULDER)) - 0.5 * (at(LEFT_HIP) + at(RIGHT_HIP))).length()

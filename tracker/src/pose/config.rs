@@ -1,4 +1,4 @@
-//! Settings of the tracker.
+//! Settings of the pose estimator.
 
 use serde::{Deserialize, Serialize};
 
@@ -6,42 +6,42 @@ use serde::{Deserialize, Serialize};
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields, rename_all = "kebab-case", default)]
 pub struct PoseConfig {
-    /// Crops whose presence is lower than this show no person, 0..1.
+    /// Least presence of a crop that shows a person, 0..=1.
     pub presence_threshold: f64,
-    /// Landmarks of lower confidence (the smaller of visibility and presence) are hidden: they prove nobody's presence and are not
-    /// triangulated, but the fit heeds where the network expects them, 0..1.
+    /// Least confidence of a visible landmark (the smaller of visibility and presence), 0..=1. Hidden ones do not count as a sign of
+    /// a person and are not triangulated, but the fit uses the network's estimate of their place.
     pub confidence_threshold: f64,
-    /// Distance up to which views agree on a landmark, metres at its depth.
+    /// Largest residual at which a view agrees on a landmark, metres at its depth.
     pub inlier_m: f64,
-    /// Standard deviation of the landmarks, as a multiple of the one measured on simulated people.
+    /// Standard deviation of the landmarks, as a multiple of that measured on simulated people.
     pub landmark_spread: f64,
     /// Standard deviation of the body's outline from the mask's (clothes, the body's shape), metres.
     pub outline_sigma_m: f64,
-    /// How often the outline of the body is matched with the masks, and its texture with the images, in a set; 0 fits the pose
-    /// to landmarks alone.
+    /// Rounds per frame set in which the body's outline is matched with the masks and its texture with the images; 0 fits the pose to
+    /// landmarks alone.
     pub outline_rounds: usize,
     /// Height of the person, metres; `None` measures it.
     pub height_m: Option<f64>,
-    /// Height of the floor in the world, along the rig's up, metres. A single camera, without [`Self::height_m`], measures people by where
-    /// their feet stand.
+    /// Height of the floor in the world, along the rig's up, metres. Without [`Self::height_m`], a single camera measures people by
+    /// where their feet stand.
     pub floor_m: f64,
     /// Rounds in which [`crate::PoseEstimator::measure_shape`] matches outlines with masks to solve for lengths, girths, build and
     /// poses together; 0 fits bone lengths to landmarks alone (docs/benchmarks/perception.md, "Shape from outlines").
     pub shape_rounds: usize,
-    /// Standard deviation of a joint's turn between sets at 30 sets a second, radians; smaller is smoother.
+    /// Standard deviation of a joint's rotation between frame sets at 30 frame sets per second, radians; smaller is smoother.
     pub smooth_rad: f64,
-    /// Distance that the body moves in a view until the network looks at that view again, metres; 0 looks at every view of
-    /// every set.
+    /// Distance that the body moves in a view until the network runs on that view again, metres; 0 runs it on every view of every
+    /// frame set.
     pub look_after_m: f64,
-    /// Views with an earlier look that the network looks at again in a set at most, those that need it most; 0: all that need it.
+    /// Most views with an earlier inference that the network runs on again per frame set, the stalest first; 0 for all that are due.
     pub max_inferences: usize,
-    /// Largest number of solver steps a frame set.
+    /// Largest number of solver steps per frame set.
     pub max_steps: usize,
-    /// Whether masks are made; off saves time where the source brings its own.
+    /// Whether masks are estimated; off saves time where the source provides its own.
     pub masks: bool,
-    /// Crops of an image that a search for a person looks at in a set; 0 looks at all of them in every set.
+    /// Crops per image and frame set that a search for a person tries; 0 for all of them in every frame set.
     pub search_crops: usize,
-    /// Frame sets without a person after which the memory of the last pose is dropped.
+    /// Frame sets without the person after which the last pose is forgotten.
     pub forget_after: u32,
 }
 

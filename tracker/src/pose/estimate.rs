@@ -1,47 +1,47 @@
-//! What the estimator hands out.
+//! Results of the pose estimator and their quality.
 
 use flyrig_types::{Mask, Pose};
 use glam::DVec3;
 
 use crate::landmarks::keypoints::{LANDMARK_COUNT, ViewKeypoints};
 
-/// Why a camera of a set has no mask.
+/// Reason why a camera has no mask in a frame set.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum NoMask {
-    /// The set has no frame of this camera.
+    /// The frame set has no frame of this camera.
     NoFrame,
-    /// The network saw no person in the crop.
+    /// The network finds no person in the crop.
     NoPerson,
     /// The fitted body lies outside this image or behind the camera.
     OutOfView,
-    /// Nothing was left after cleaning.
+    /// The mask was empty after cleaning.
     Empty,
-    /// The settings ask for no masks.
+    /// The settings turn masks off.
     Off,
 }
 
-/// How well one camera agrees with the fitted body.
+/// Agreement of one camera with the fitted body.
 #[derive(Debug, Clone, PartialEq)]
 pub struct ViewQuality {
-    /// Network's probability that the crop shows a person; 0 where there was no frame.
+    /// Network's probability that the crop shows a person; 0 without a frame.
     pub presence: f64,
     /// Landmarks that the pose fit used and that lie within the inlier distance.
     pub inliers: usize,
     /// Median distance in pixels between the usable landmarks and the fitted body's; `None` without any.
     pub residual_px: Option<f64>,
-    /// Overlap (intersection over union) of the mask and the fitted body's outline, 0..1; `None` without a mask.
-    /// Clothes and hair keep it below 1; a body off the person shows as a low value.
+    /// Intersection over union of the mask and the fitted body's silhouette, 0..=1; `None` without a mask. Clothes and hair keep it
+    /// below 1; a low value means that the body is off the person.
     pub mask_overlap: Option<f64>,
-    /// Why there is no mask; `None` when there is one.
+    /// Reason why there is no mask; `None` when there is one.
     pub no_mask: Option<NoMask>,
 }
 
-/// Time spent in the stages of one estimate, seconds.
+/// Time per stage of one estimate, seconds.
 #[derive(Debug, Clone, Copy, PartialEq, Default)]
 pub struct StageSeconds {
     /// Search of whole images for a person.
     pub search: f64,
-    /// Network on the crops around a followed person.
+    /// Pose network on the crops around a tracked person.
     pub net: f64,
     /// Triangulation.
     pub triangulate: f64,
@@ -53,32 +53,32 @@ pub struct StageSeconds {
     pub outline: f64,
 }
 
-/// How far an estimate may be trusted.
+/// Quality of an estimate.
 #[derive(Debug, Clone, PartialEq)]
 pub struct PoseQuality {
-    /// A slot a camera, rig order.
+    /// Quality of each view, in rig order.
     pub views: Vec<ViewQuality>,
-    /// Median over all views of the landmarks' distance to the fitted body, pixels.
+    /// Median distance of the landmarks of all views from the fitted body, pixels.
     pub residual_px: f64,
     /// Landmarks that two or more views agreed on.
     pub triangulated: usize,
-    /// Views that the network looked at; the others' landmarks and masks were carried along.
+    /// Views that the network ran on; landmarks and masks of the others were carried along.
     pub inferred: usize,
-    /// Where the time went.
+    /// Time per stage.
     pub seconds: StageSeconds,
 }
 
 /// Pose of the person in one frame set.
 #[derive(Debug, Clone, PartialEq)]
 pub struct PoseEstimate {
-    /// For the skeleton of [`crate::PoseEstimator::template`], at the set's master time.
+    /// Pose of the skeleton of [`crate::PoseEstimator::template`] at the frame set's master time.
     pub pose: Pose,
-    /// A slot a camera: the person's mask at the image's size.
+    /// Person's mask in each view, at the image's size, in rig order.
     pub masks: Vec<Option<Mask>>,
-    /// A slot a camera: what the network saw.
+    /// Landmarks of each view in which the network ran and found the person, in rig order.
     pub keypoints: Vec<Option<ViewKeypoints>>,
     /// Triangulated landmarks in the world, metres.
     pub points: [Option<DVec3>; LANDMARK_COUNT],
-    /// How far to trust it.
+    /// Quality.
     pub quality: PoseQuality,
 }

@@ -1,4 +1,8 @@
-//! The estimator: frame sets in, poses and masks out.
+//! The pose estimator of one person: frame sets in, poses and masks out.
+//!
+//! One frame set in steps: landmarks of the due views ([`follow`]), a pose fitted to them, masks gated by that body ([`masks`]), then
+//! the pose whose outline lies on that of the masks and whose surface shows the brightness that each camera remembers of it
+//! ([`refine`]). A person who is lost is searched for over several frame sets. [`shape`] measures the person's shape.
 
 mod follow;
 mod masks;
@@ -31,7 +35,7 @@ use crate::masks::carried_mask::{carried_mask, corners};
 use crate::masks::gate::BodyGate;
 use crate::masks::gated_mask::gated_mask;
 use crate::masks::silhouette::{coarse_mask, refine};
-use crate::network::parallel::beside_each_other;
+use crate::network::parallel::map_parallel;
 use crate::network::pose_net::PoseNet;
 use crate::pose::body_model::{BodyModel, JointTurns};
 use crate::pose::config::PoseConfig;
@@ -44,43 +48,43 @@ use crate::shape::body_shape::ShapeSpace;
 use crate::shape::bone_lengths::{ShapeFit, fit_template_shape, height_m, seen_landmarks, template_of_height};
 use crate::shape::shape_solve::{ShapeAndPoses, ShapeProblem, ShapeSet};
 
-/// Usable landmarks in one view below which there is nobody to fit.
+/// Least number of usable landmarks in one view for a fit.
 const MIN_LANDMARKS: usize = 8;
-/// Residual in inlier distances above which a followed pose has come off the person.
+/// Residual above which a tracked pose has come off the person, multiples of the inlier distance.
 const OFF_TRACK: f64 = 1.5;
-/// Camera times farther from the set's than this are not believed, seconds.
+/// Limit of the difference between a camera's time and the frame set's, seconds.
 const MAX_DELAY_SECS: f64 = 0.1;
-/// Nobody's landmarks move faster, metres a second.
+/// Limit of a landmark's speed, metres per second.
 const MAX_SPEED: f64 = 12.0;
-/// Cameras that expose nearer to the set's time see the body where it is then, seconds.
+/// Time difference below which a camera shows the body as at the frame set's time, seconds.
 const MIN_DELAY_SECS: f64 = 5e-4;
-/// After a loss the whole image is searched in every set, and ever more rarely up to every so many sets.
+/// Longest period between two searches after a loss, frame sets; it grows with the time since the loss.
 const RAREST_SEARCH: u32 = 8;
 
-/// Landmarks in the world, metres.
+/// Places of the body landmarks in the world, metres.
 pub type Marks = [DVec3; LANDMARK_COUNT];
 
-/// The person as last seen.
+/// State of a tracked person after the last frame set.
 #[derive(Debug, Clone)]
 struct Track {
     turns: JointTurns,
     nanos: i64,
     marks: [DVec3; LANDMARK_COUNT],
-    /// Metres a second; `None` of a person who was seen at one instant only.
+    /// Landmark velocities, metres per second; `None` for a person who was seen at one instant only.
     velocity: Option<[DVec3; LANDMARK_COUNT]>,
-    /// By slot.
+    /// Last inference of each view, in rig order.
     inferences: Vec<Option<Inference>>,
     texture: Texture,
 }
 
 impl Track {
-    /// Landmarks at a time a little later.
+    /// Extrapolates the landmarks to a later time.
     fn predicted(&self, nanos: i64) -> [DVec3; LANDMARK_COUNT] {
         let ahead = secs(nanos.saturating_sub(self.nanos)).clamp(0.0, MAX_DELAY_SECS);
         std::array::from_fn(|i| self.marks[i] + self.motion(i, ahead))
     }
 
-    /// How far a landmark moves in a time, metres.
+    /// Returns the displacement of a landmark in a time, metres.
     fn motion(&self, landmark: usize, secs: f64) -> DVec3 {
         self.velocity.map_or(DVec3::ZERO, |velocity| velocity[landmark] * secs)
     }
@@ -90,27 +94,27 @@ impl Track {
 #[derive(Debug, Clone)]
 pub struct PoseEstimator {
     net: PoseNet,
-    /// As it was given.
+    /// Template as it was given.
     base: Template,
-    /// In the person's shape.
+    /// Template in the person's shape.
     template: Template,
-    /// The same in shoes, where they are known: what outlines and texture are compared with.
+    /// Template in shoes, where they are known: outlines and texture are compared with it.
     surface: Arc<Template>,
     model: BodyModel,
     rig: Rig,
     config: PoseConfig,
-    /// By slot.
+    /// Backgrounds in rig order.
     backgrounds: Vec<Option<Arc<Background>>>,
     track: Option<Track>,
     search: Search,
-    /// Sets since the person was last seen.
+    /// Frame sets since the person was last seen.
     lost: u32,
-    /// Whether the network inferences at every view of every set.
+    /// Whether the network runs on every view of every frame set.
     infers_always: bool,
-    /// Whether sightings are kept, and the last one.
+    /// Whether shape sightings are kept; the last one is `sighting`.
     keeps_sightings: bool,
     clothes: Clothes,
-    /// Whether nobody else was known in the last set.
+    /// Whether no other person was known in the last frame set.
     is_alone: bool,
     sighting: Option<ShapeSighting>,
 }
@@ -118,13 +122,13 @@ pub struct PoseEstimator {
 /// Clothes of the person.
 #[derive(Debug, Clone)]
 enum Clothes {
-    /// Nobody has inferred yet.
+    /// Not measured yet.
     Unknown,
-    /// The body as it is dressed.
+    /// Measured: the body as it is dressed.
     Known(Arc<Template>),
 }
 
-/// A fitted pose before it is believed.
+/// Fitted pose before it is accepted.
 #[derive(Debug, Clone)]
 struct Fitted {
     turns: JointTurns,
@@ -133,33 +137,34 @@ struct Fitted {
     points: [Option<WorldPoint>; LANDMARK_COUNT],
     views: Vec<ViewQuality>,
     residual_px: f64,
-    /// Residual in inlier distances.
+    /// Residual, multiples of the inlier distance.
     relative: f64,
     evidence: Evidence,
 }
 
-/// The measurements behind a fitted pose.
+/// Measurements behind a fitted pose.
 #[derive(Debug, Clone)]
 struct Evidence {
-    /// An element a frame.
+    /// One element per frame.
     views: Vec<FitView>,
     points: [Option<(DVec3, f64)>; LANDMARK_COUNT],
     before: Option<Before>,
 }
 
 impl Fitted {
-    /// Views that the network inferred at in this set.
+    /// Returns the number of views that the network ran on in this frame set.
     fn inferred(&self) -> usize {
         self.inferences.iter().flatten().filter(|inference| inference.body.is_none()).count()
     }
 
-    /// Time of a slot's frame less the set's, seconds.
+    /// Returns the time of a slot's frame relative to the frame set's, seconds.
     fn delay_secs(&self, slot: usize) -> f64 {
         self.evidence.views.iter().find(|view| view.slot == slot).map_or(0.0, |view| view.delay_secs)
     }
 }
 
 impl Evidence {
+    /// Returns the fit of a pose to these measurements.
     fn problem<'a>(&'a self, model: &'a BodyModel, config: &PoseConfig) -> FitProblem<'a> {
         FitProblem {
             model,
@@ -174,7 +179,7 @@ impl Evidence {
 }
 
 impl PoseEstimator {
-    /// For one template (see [`Self::fit_shape`] for its size) and one rig.
+    /// Creates an estimator for one template (see [`Self::fit_shape`] for its size) and one rig.
     ///
     /// # Errors
     /// Kinds `Rig` and `Template` when either is not usable.
@@ -205,33 +210,33 @@ impl PoseEstimator {
         })
     }
 
-    /// Lets the network inference at every view of every set, whether the body moves or not.
+    /// Sets whether the network runs on every view of every frame set even if the body is still.
     pub(crate) fn infer_always(&mut self, always: bool) {
         self.infers_always = always;
     }
 
-    /// Keeps each set's sighting for [`Self::measure_shape`]; the network inferences at every view of every set then.
+    /// Sets whether each frame set's sighting is kept for [`Self::measure_shape`]; the network then runs on every view.
     pub fn keep_sightings(&mut self, keep: bool) {
         (self.infers_always, self.keeps_sightings, self.sighting) = (keep, keep, None);
     }
 
-    /// Returns the sighting of the last set that was estimated; `None` where there was nobody, or where none is kept.
+    /// Returns the sighting of the last frame set; `None` without a person, or where none is kept.
     pub fn take_sighting(&mut self) -> Option<ShapeSighting> {
         self.sighting.take()
     }
 
-    /// Returns the settings, to change them from the next set on.
+    /// Returns the settings, to change them from the next frame set on.
     pub fn config_mut(&mut self) -> &mut PoseConfig {
         &mut self.config
     }
 
-    /// The template, with the person's bone lengths once [`Self::fit_shape`] has run.
+    /// Returns the template, in the person's shape once [`Self::fit_shape`] has run.
     #[must_use]
     pub fn template(&self) -> &Template {
         &self.template
     }
 
-    /// Gives a camera's empty image; masks of that camera then heed the difference to it as well.
+    /// Sets the image of the empty scene of a camera; masks then use the difference from it.
     ///
     /// # Errors
     /// Kind `Frames` when there is no such camera, `Image` when the size differs or the format cannot be read.
@@ -246,20 +251,19 @@ impl PoseEstimator {
         Ok(())
     }
 
-    /// Sets the backgrounds by slot, one a camera; masks then use the difference to them. Fewer leave the last cameras without
-    /// one.
+    /// Sets the backgrounds in rig order; masks then use the difference from them. Missing ones at the end count as `None`.
     pub fn set_backgrounds(&mut self, mut backgrounds: Vec<Option<Arc<Background>>>) {
         backgrounds.resize(self.rig.cameras.len(), None);
         self.backgrounds = backgrounds;
     }
 
-    /// Returns the backgrounds by slot, to update them; masks do without until they are set again.
+    /// Takes the backgrounds out, in rig order, to update them; masks do without until they are set again.
     pub fn take_backgrounds(&mut self) -> Vec<Option<Arc<Background>>> {
         std::mem::replace(&mut self.backgrounds, vec![None; self.rig.cameras.len()])
     }
 
-    /// A camera stands elsewhere from the next set on. What the network saw in its last image is forgotten; its background is not
-    /// moved along. A slot that does not exist changes nothing.
+    /// Replaces a camera that has moved, from the next frame set on. Its last inference is forgotten; its background stays. Slots that
+    /// do not exist are ignored.
     pub fn move_camera(&mut self, slot: usize, camera: &Camera) {
         if let Some(known) = self.rig.cameras.get_mut(slot) {
             known.clone_from(camera);
@@ -268,19 +272,20 @@ impl PoseEstimator {
         }
     }
 
-    /// Returns a camera's background, where it is known.
+    /// Returns the background of a camera, where it is known.
     #[must_use]
     pub fn background(&self, slot: usize) -> Option<&Background> {
         self.backgrounds.get(slot)?.as_deref()
     }
 
-    /// Looks for the person where a pose puts him at a time; false for a pose that does not fit the template.
+    /// Tracks the person from a pose at a time in nanoseconds on; returns false for a pose that does not fit the template.
     pub fn start_from(&mut self, pose: &flyrig_types::Pose, nanos: i64) -> bool {
         let Some(turns) = self.model.to_turns(pose) else { return false };
         self.start_at(turns, nanos);
         true
     }
 
+    /// Tracks the person from a pose at a time on.
     fn start_at(&mut self, turns: JointTurns, nanos: i64) {
         let marks = self.model.marks(&turns);
         self.track = Some(Track {
@@ -294,23 +299,23 @@ impl PoseEstimator {
         self.lost = 0;
     }
 
-    /// Forgets the last pose: the next set is searched from nothing.
+    /// Forgets the last pose, so that the next frame set is searched.
     pub fn reset(&mut self) {
         self.track = None;
         self.lost = 0;
     }
 
-    /// Returns pose, masks and quality of one frame set; sets come in the order of time.
+    /// Estimates pose, masks and quality of one frame set; frame sets come in order of time.
     ///
     /// # Errors
-    /// Kind `Lost` when no person was found: call again with the next set, the search goes on by itself.
-    /// Kinds `Frames`, `Image` and `Net` when the input is not usable. The state stays sound in any case.
+    /// Kind `Lost` when no person was found: call again with the next frame set, the search continues. Kinds `Frames`, `Image` and
+    /// `Net` when the input is not usable. The state stays valid in any case.
     pub fn estimate(&mut self, set: &FrameSet) -> Result<PoseEstimate, TrackError> {
         self.estimate_among(set, &[], true)
     }
 
-    /// As [`Self::estimate`], beside people whose landmarks are known in the world: a sighting of one of them is nobody else.
-    /// Without `may_search` a person who cannot be followed is lost in this set.
+    /// Estimates as [`Self::estimate`] does, beside other people whose landmarks are known: sightings of them are rejected. Without
+    /// `may_search` a person who cannot be tracked is lost in this frame set.
     ///
     /// # Errors
     /// Those of [`Self::estimate`].
@@ -324,7 +329,7 @@ impl PoseEstimator {
         (self.sighting, self.is_alone) = (None, others.is_empty());
         let mut seconds = StageSeconds::default();
         let found = if pictures.iter().all(Option::is_none) {
-            // A prediction alone is nobody.
+            // A prediction alone is no person.
             Err(TrackError::new(TrackErrorKind::Lost, "every image is uniform; uncover the lenses, or check the light"))
         } else {
             self.follow_or_search(set, &pictures, others, may_search, &mut seconds)
@@ -369,7 +374,7 @@ impl PoseEstimator {
         })
     }
 
-    /// Makes the masks, and fits the pose to their outlines and the texture.
+    /// Estimates the masks, and fits the pose to their outlines and the texture.
     fn finish(
         &self,
         set: &FrameSet,
@@ -397,20 +402,20 @@ impl PoseEstimator {
         (fitted, masks)
     }
 
-    /// Landmarks of the person at a time, as they have moved of late; `None` while nobody is tracked.
+    /// Extrapolates the person's landmarks to a time in nanoseconds; `None` while no person is tracked.
     #[must_use]
     pub fn predicted_landmarks(&self, nanos: i64) -> Option<Marks> {
         self.track.as_ref().map(|track| track.predicted(nanos))
     }
 
-    /// Frame sets since the person was seen last; 0 for one who is tracked.
+    /// Returns the number of frame sets since the person was last seen; 0 for one who is tracked.
     #[must_use]
     pub fn sets_lost(&self) -> u32 {
         if self.track.is_some() { self.lost } else { self.lost.max(1) }
     }
 
-    /// Chooses the clothes that masks allow for, and the shoes whose outlines the pose is fitted to. Once they are known, masks reach less
-    /// far from the body, and things and people nearby are no part of them.
+    /// Sets the person's clothes: masks reach less far from the body once they are known, so that things and people nearby are no
+    /// part of them, and the pose is fitted to the outlines of the shoes.
     ///
     /// # Errors
     /// Kind `Template` for a body that cannot wear them.
@@ -419,14 +424,14 @@ impl PoseEstimator {
             let dressed = outfit.on(&self.template);
             dressed.map(Arc::new).map_err(|error| TrackError::new(TrackErrorKind::Template, error.to_string()))
         };
-        // A skirt swings: its outline says nothing of the legs.
+        // A skirt swings: its outline does not constrain the legs.
         let surface = dressed(Outfit { skirt: None, ..outfit })?;
         self.clothes = Clothes::Known(if outfit.skirt.is_some() { dressed(outfit)? } else { surface.clone() });
         self.change_surface(surface);
         Ok(())
     }
 
-    /// Takes another surface of the person; a texture belongs to one surface.
+    /// Replaces the person's surface; the texture of another surface is forgotten.
     fn change_surface(&mut self, surface: Arc<Template>) {
         if let Some(track) = self.track.as_mut().filter(|_| *surface != *self.surface) {
             track.texture = Texture::new(&surface, self.rig.cameras.len());
@@ -434,30 +439,30 @@ impl PoseEstimator {
         self.surface = surface;
     }
 
-    /// Lets masks reach as far as wide clothes: somebody else may have come.
+    /// Forgets the clothes, so that masks reach as far as wide ones: another person may have come.
     pub fn forget_clothes(&mut self) {
         self.clothes = Clothes::Unknown;
     }
 
-    /// Gives up what is being tracked: it turned out to be somebody else. The search begins anew.
+    /// Drops the tracked person, who turned out to be another one. The search begins anew.
     pub fn drop_track(&mut self) {
         self.track = None;
         self.lost = self.lost.max(1);
     }
 
-    /// Lets this estimator follow whom another one follows, from the next set on; the other one has lost the person then.
+    /// Takes over the person tracked by another estimator, from the next frame set on; the other one has then lost the person.
     pub fn take_track(&mut self, other: &mut Self) {
         self.track = other.track.take();
         self.lost = 0;
         other.lost = 1;
     }
 
-    /// Vertices and normals of a pose at a time after it, as the body has moved since the last set.
+    /// Skins a pose at a delay after its time, extrapolated by the motion since the last frame set. Returns world vertices and normals.
     fn skinned(&self, turns: &JointTurns, set: &FrameSet, delay_secs: f64) -> (Vec<Vec3>, Vec<Vec3>) {
         self.skinned_in(&self.surface, turns, set, delay_secs)
     }
 
-    /// The same of the body as it is dressed.
+    /// Skins a template as [`Self::skinned`] does.
     fn skinned_in(
         &self,
         template: &Template,
@@ -472,13 +477,14 @@ impl PoseEstimator {
         skin_mesh(template, &self.model.to_pose(moved.as_ref().unwrap_or(turns)))
     }
 
-    /// World positions of the landmarks on the template in a pose, metres; `None` for a pose that does not
-    /// fit the template.
+    /// Returns the world positions of the landmarks on the template in a pose, metres; `None` for a pose that does not fit the
+    /// template.
     #[must_use]
     pub fn landmarks(&self, pose: &flyrig_types::Pose) -> Option<Marks> {
         self.model.to_turns(pose).map(|turns| self.model.marks(&turns))
     }
 
+    /// Reads the images of a frame set; blank ones count as missing.
     fn check<'a>(&self, set: &'a FrameSet) -> Result<Vec<Option<Rgb<'a>>>, TrackError> {
         let frames_error = |message: String| TrackError::new(TrackErrorKind::Frames, message);
         if set.frames.len() != self.rig.cameras.len() {
@@ -502,6 +508,7 @@ impl PoseEstimator {
         set.frames.iter().zip(&self.rig.cameras).map(read).collect()
     }
 
+    /// Stores the pose of a frame set as the state to track from.
     fn remember(
         &mut self,
         set: &FrameSet,
@@ -513,9 +520,9 @@ impl PoseEstimator {
         let velocity = self.track.as_ref().and_then(|last| {
             let dt = secs(set.master_nanos.saturating_sub(last.nanos));
             match dt {
-                // The same set again.
+                // Repeated frame set.
                 _ if dt < 1e-3 => last.velocity,
-                // Too long ago to say anything of now.
+                // Too long ago to predict from.
                 _ if dt >= 0.2 => Some([DVec3::ZERO; LANDMARK_COUNT]),
                 _ => Some(std::array::from_fn(|i| {
                     let now = ((marks[i] - last.marks[i]) / dt).clamp_length_max(MAX_SPEED);

@@ -1,8 +1,9 @@
-//! Damped least squares of a body's turns on landmarks.
+//! Damped least squares of a body's joint rotations on landmarks, outlines and texture.
 //!
-//! The cost is a sum of halves of squared residuals, each divided by its standard deviation: landmark
-//! distances in the images and to world points (Cauchy weights), distances of the body's outline from the
-//! masks' and of its texture from the lines of its brightness (Geman-McClure weights), joint ranges, and the change since the last pose. Levenberg-Marquardt with analytic derivatives; only steps that lower the cost are taken.
+//! The cost is half the sum of squared residuals over their standard deviations: landmark distances in the images and to world
+//! points (Cauchy weights), distances of the body's outline from the masks' and of its texture from the lines of its brightness
+//! (Geman-McClure weights), joint ranges, and the change since the last pose. Levenberg-Marquardt with analytic derivatives accepts
+//! only steps that lower the cost.
 
 use flyrig_solve::{
     Convergence, DenseNormal, Kernel, PointPair, Problem, align_rigid, exp_rotation, left_jacobian_inverse,
@@ -17,7 +18,7 @@ use crate::landmarks::keypoints::LANDMARK_COUNT;
 use crate::pose::body_model::{BodyModel, JointTurns, PosedSkeleton};
 use crate::pose::line_point::{LineKind, LinePoint};
 
-/// Weight of a landmark in the fit: the face's many points are one body, and the fingers' are vague.
+/// Weight of each landmark: the many points of the face are one rigid body, and those of the fingers are vague.
 const LANDMARK_WEIGHT: [f64; LANDMARK_COUNT] = {
     let mut weight = [1.0; LANDMARK_COUNT];
     let mut i = 1;
@@ -33,36 +34,37 @@ const LANDMARK_WEIGHT: [f64; LANDMARK_COUNT] = {
     weight
 };
 
-/// How sharply a joint's limit is enforced, radians.
+/// Standard deviation beyond a joint's limit, radians.
 const LIMIT_SIGMA: f64 = 0.05;
-/// Points in a view that count as many measurements; more of them share their weight, for neighbours err alike.
+/// Number of independent measurements that the line points of a view are worth: more points share their weight, since the errors of
+/// neighbours are correlated.
 const OUTLINE_COUNT: f64 = 80.0;
 const TEXTURE_COUNT: f64 = 20.0;
-/// Distances of this many standard deviations lose three quarters of their weight: they belong to another edge.
+/// Distance at which a line point loses three quarters of its weight, standard deviations: it belongs to another edge.
 const LINE_ROBUST: f64 = 3.0;
 
-/// Weight of outline points where the mask goes beyond the body: a coat or a skirt does that, but no body is outside of its
+/// Weight of outline points where the mask reaches beyond the body: a coat or a skirt does that, but no body is outside its
 /// clothes.
 const CLOTH_WEIGHT: f64 = 0.1;
 
-/// How much freer the root turns than a joint, and how far it moves, between sets.
+/// Standard deviation of the root's rotation between frame sets as a multiple of a joint's, and of its motion, metres.
 const ROOT_FREEDOM: f64 = 2.0;
 const ROOT_MOVE_M: f64 = 0.2;
 
-/// One view's part of the data.
+/// Landmarks of one view.
 #[derive(Debug, Clone)]
 pub(crate) struct FitView {
-    /// The camera's place in the rig.
+    /// Index of the camera in the rig.
     pub slot: usize,
     pub view: View,
     pub seen: [Option<Observation>; LANDMARK_COUNT],
-    /// Where each landmark was when it was seen less where it is at the pose's time, metres.
+    /// Displacement of each landmark from the pose's time to its observation, world metres.
     pub shift: [DVec3; LANDMARK_COUNT],
-    /// Capture time less the pose's time, seconds.
+    /// Capture time relative to the pose's time, seconds.
     pub delay_secs: f64,
 }
 
-/// The pose before, and how far it may have changed.
+/// Last pose and the expected change since.
 #[derive(Debug, Clone)]
 pub(crate) struct Before {
     pub turns: JointTurns,
@@ -70,44 +72,46 @@ pub(crate) struct Before {
     pub sigma_rad: f64,
 }
 
-/// What a pose has to explain.
+/// Measurements and priors of a pose.
 #[derive(Debug, Clone)]
 pub(crate) struct FitProblem<'a> {
     pub model: &'a BodyModel,
     pub views: &'a [FitView],
-    /// Points of the body's surface with the lines they belong on.
+    /// Points of the body's surface with the image lines that they belong on.
     pub lines: &'a [LinePoint],
-    /// World points of landmarks and their standard deviation in metres.
+    /// World points of landmarks and their standard deviations, metres.
     pub points: [Option<(DVec3, f64)>; LANDMARK_COUNT],
     pub before: Option<Before>,
-    /// Standard deviation of the landmarks, as a multiple of the one measured.
+    /// Standard deviation of the landmarks, as a multiple of that measured on simulated people.
     pub landmark_spread: f64,
-    /// Residuals of this many standard deviations lose half their weight.
+    /// Residual at which a landmark loses half its weight, standard deviations.
     pub robust: f64,
 }
 
-/// Columns of a joint's three parameters.
+/// Returns the first of the three columns of an active joint.
 fn column(index_of_active: usize) -> usize {
     3 + 3 * index_of_active
 }
 
 impl FitProblem<'_> {
-    /// Joints that turn: the root and those with a range.
+    /// Returns the joints that turn: the root and those with a range.
     fn active(&self) -> Vec<usize> {
         (0..self.model.parents.len()).filter(|&j| j == 0 || self.model.ranges[j].is_some()).collect()
     }
 
+    /// Returns the motion of the root since the last pose, standard deviations.
     fn root_move(&self, turns: &JointTurns) -> Option<DVec3> {
         let before = self.before.as_ref()?;
         Some((turns.root - before.turns.root) / Self::root_sigma(before))
     }
 
+    /// Returns the standard deviation of the root's motion, metres.
     fn root_sigma(before: &Before) -> f64 {
-        // In proportion to the turns' freedom, which already knows the time that passed.
+        // In proportion to that of the joints, which depends on the elapsed time.
         ROOT_MOVE_M * before.sigma_rad / 0.15
     }
 
-    /// Calls `each` with every landmark and its pull in the world.
+    /// Calls `each` with every observed landmark and its share of the normal equations.
     #[allow(clippy::needless_range_loop)] // a landmark indexes the views' arrays and the model alike
     fn data_terms(&self, posed: &PosedSkeleton, mut each: impl FnMut(usize, DataTerm)) {
         let kernel = Kernel::Cauchy(self.robust);
@@ -146,8 +150,7 @@ impl FitProblem<'_> {
         }
     }
 
-    /// Calls `each` with every point on a line, the derivative of its residual by its place in the world, the residual, the
-    /// weight and the cost.
+    /// Calls `each` with every line point, the derivative of its residual by its world place, the residual, the weight and the cost.
     fn line_terms(&self, posed: &PosedSkeleton, mut each: impl FnMut(&LinePoint, DVec3, f64, f64, f64)) {
         let mut counts = vec![[0.0f64; 2]; self.views.len()];
         for point in self.lines {
@@ -176,7 +179,7 @@ impl FitProblem<'_> {
         }
     }
 
-    /// Calls `each` with (index among the active joints, residual, derivative by the joint's turn).
+    /// Calls `each` with the index of every active joint, its residual and the derivative by the joint's rotation.
     fn joint_terms(&self, turns: &JointTurns, mut each: impl FnMut(usize, DVec3, DMat3)) {
         for (index, joint) in self.active().into_iter().enumerate() {
             let turn = turns.turns[joint];
@@ -201,8 +204,8 @@ impl FitProblem<'_> {
         }
     }
 
-    /// Minimises from a start; gives the best pose found and the number of steps taken. `None` when even
-    /// the start has no finite cost.
+    /// Minimises from a start; returns the best pose found and the number of steps. `None` when even the start has no finite
+    /// cost.
     pub fn solve(&self, start: &JointTurns, max_steps: usize) -> Option<(JointTurns, usize)> {
         let options = Convergence { max_steps, min_gain: 1e-4, ..Convergence::default() };
         minimize(self, start, &options).map(|solution| (solution.unknowns, solution.steps))
@@ -213,7 +216,7 @@ impl Problem for FitProblem<'_> {
     type Unknowns = JointTurns;
     type Normal = DenseNormal;
 
-    /// Cost of a pose; not finite when nothing can be said.
+    /// Returns the cost of a pose; not finite for an unusable one.
     fn cost(&self, turns: &JointTurns) -> f64 {
         let posed = self.model.pose(turns);
         let mut cost = 0.0;
@@ -223,7 +226,7 @@ impl Problem for FitProblem<'_> {
         cost + self.root_move(turns).map_or(0.0, |e| 0.5 * e.length_squared())
     }
 
-    /// Normal matrix and gradient at a pose; columns: root place, then three a turning joint.
+    /// Returns normal matrix and gradient at a pose; columns: place of the root, then three per active joint.
     fn linearize(&self, turns: &JointTurns) -> Option<DenseNormal> {
         Some(self.linearize_with(turns, None))
     }
@@ -241,7 +244,7 @@ impl Problem for FitProblem<'_> {
 }
 
 impl FitProblem<'_> {
-    /// As [`Problem::linearize`], with the parameters of the shape in the last columns.
+    /// Linearises as [`Problem::linearize`] does, with the parameters of the shape in the last columns.
     pub fn linearize_with(&self, turns: &JointTurns, shape: Option<&ShapeDerivatives>) -> DenseNormal {
         let active = self.active();
         let pose_size = column(active.len());
@@ -299,7 +302,7 @@ impl FitProblem<'_> {
                 scalars.extend((0..shape.count).map(|k| {
                     let mut moved = DVec3::ZERO;
                     for (bone, share, _) in &point.bones {
-                        // What is worn over the body keeps its thickness.
+                        // Clothes over the body keep their thickness.
                         let local = shape.positions[k][point.vertex] - shape.origins[k][*bone];
                         moved += (moves[k][*bone] + posed.rotation[*bone] * local) * *share;
                     }
@@ -335,28 +338,28 @@ impl FitProblem<'_> {
         DenseNormal { matrix: normal, gradient }
     }
 
-    /// Number of a pose's parameters.
+    /// Returns the number of a pose's parameters.
     pub fn pose_size(&self) -> usize {
         column(self.active().len())
     }
 }
 
-/// Derivatives of a model by the parameters of its shape, canonical metres: by parameter, then by joint, landmark or vertex.
+/// Derivatives of a model by the parameters of its shape, canonical metres; indexed by parameter, then joint, landmark or vertex.
 #[derive(Debug, Clone, Default)]
 pub(crate) struct ShapeDerivatives {
     pub count: usize,
-    /// Of the joints' origins.
+    /// Derivatives of the joints' origins.
     pub origins: Vec<Vec<DVec3>>,
-    /// Of the offsets from the parents' origins.
+    /// Derivatives of the offsets from the parents' origins.
     pub offsets: Vec<Vec<DVec3>>,
-    /// Of the landmarks' places from the origins of their joints.
+    /// Derivatives of the landmarks' places relative to the origins of their joints.
     pub marks: Vec<[DVec3; LANDMARK_COUNT]>,
-    /// Of the vertices.
+    /// Derivatives of the vertices.
     pub positions: Vec<Vec<DVec3>>,
 }
 
 impl ShapeDerivatives {
-    /// Derivatives of the joints' world origins in a pose.
+    /// Returns the derivatives of the joints' world origins in a pose.
     fn of_origins(&self, model: &BodyModel, posed: &PosedSkeleton) -> Vec<Vec<DVec3>> {
         self.offsets
             .iter()
@@ -372,7 +375,7 @@ impl ShapeDerivatives {
     }
 }
 
-/// One landmark's share of the normal equations, in world axes.
+/// Share of one landmark in the normal equations, world axes.
 #[derive(Debug, Clone, Copy, Default)]
 struct DataTerm {
     normal: DMat3,
@@ -381,14 +384,15 @@ struct DataTerm {
 }
 
 impl DataTerm {
+    /// Adds one residual with its derivative.
     fn add(&mut self, row: DVec3, residual: f64, weight: f64) {
         self.normal += DMat3::from_cols(row * row.x, row * row.y, row * row.z) * weight;
         self.gradient += row * (residual * weight);
     }
 }
 
-/// Turn and place that bring the bind pose's trunk and head onto world points; `None` with fewer than three, or where those
-/// lie on a line.
+/// Returns the bind pose moved so that trunk and head lie on world points (metres); `None` with fewer than three points, or where
+/// they are collinear.
 pub(crate) fn align_trunk(model: &BodyModel, points: &[Option<DVec3>; LANDMARK_COUNT]) -> Option<JointTurns> {
     const TRUNK: [usize; 9] = [0, 7, 8, 11, 12, 23, 24, 25, 26];
     let pairs: Vec<PointPair> = TRUNK

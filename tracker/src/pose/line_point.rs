@@ -1,4 +1,4 @@
-//! Points of the body's surface that belong on lines in an image: what outlines and texture say of a pose.
+//! Points of the body's surface that belong on lines in an image: the form in which outlines and texture constrain a pose.
 
 use std::collections::HashMap;
 
@@ -9,59 +9,60 @@ use glam::{DVec2, DVec3, Vec3};
 use crate::image::view::View;
 use crate::pose::body_model::BodyModel;
 
-/// Where a line comes from.
+/// Source of a line.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(crate) enum LineKind {
-    /// The end of a mask.
+    /// Border of a mask.
     Outline,
-    /// The brightness that the point had before.
+    /// Remembered brightness of the point.
     Texture,
 }
 
-/// A point of the body's surface in a view, and the line in the image that it belongs on.
+/// Point of the body's surface in a view, and the image line that it belongs on.
 #[derive(Debug, Clone)]
 pub(crate) struct LinePoint {
     pub kind: LineKind,
     /// Vertex of the template.
     pub vertex: usize,
-    /// Offset from that vertex to the point, canonical metres: the thickness of clothes.
+    /// Offset of the point from that vertex, canonical metres: the thickness of clothes.
     pub worn: DVec3,
     /// Index of the view in the fit.
     pub view: usize,
     /// Normal of the line, undistorted pixels.
     pub normal: DVec2,
-    /// Place of the line along its normal, undistorted pixels from the principal point.
+    /// Distance of the line from the principal point along its normal, undistorted pixels.
     pub offset: f64,
-    /// Standard deviation of the distance from the line, undistorted pixels.
+    /// Standard deviation of the point's distance from the line, undistorted pixels.
     pub sigma_px: f64,
-    /// Joints that carry the vertex, their weights (sum 1) and the vertex from the joint's origin, canonical metres.
+    /// Joints that carry the point, their weights (sum 1) and the point relative to each joint's origin, canonical metres.
     pub bones: Vec<(usize, f64, DVec3)>,
     /// Motion from the pose's time to the image's, world metres.
     pub shift: DVec3,
 }
 
 impl LinePoint {
-    /// Hangs the point on the bones of a model of the template's shape.
+    /// Attaches the point to the bones of a model of the template's shape.
     pub fn hang(&mut self, model: &BodyModel, template: &Template) {
         self.bones = bones(model, template, self.vertex);
         self.bones.iter_mut().for_each(|(_, _, local)| *local += self.worn);
     }
 }
 
-/// The vertices of a body below its clothes.
+/// Bare body below clothes, to find its vertices by place.
 pub(crate) struct BareBody<'a> {
     body: &'a Template,
-    /// Most of a dressed body's vertices are those of the bare one, at other indices.
+    /// Vertex at each place: most vertices of a dressed body are those of the bare one, at other indices.
     by_place: HashMap<[u32; 3], usize>,
 }
 
 impl<'a> BareBody<'a> {
+    /// Indexes the vertices of a body.
     pub fn new(body: &'a Template) -> Self {
         let by_place = body.positions.iter().enumerate().map(|(vertex, at)| (key(*at), vertex)).collect();
         Self { body, by_place }
     }
 
-    /// Hangs a point of a dressed body on the nearest vertex of the bare one, as far outside as it is: it then moves with the body's shape.
+    /// Attaches a point of a dressed body to the nearest vertex of the bare one, at its offset, so that it moves with the body's shape.
     pub fn undress(&self, point: &mut LinePoint, dressed: &Template) {
         let Some(at) = dressed.positions.get(point.vertex) else { return };
         let bare = &self.body.positions;
@@ -73,11 +74,12 @@ impl<'a> BareBody<'a> {
     }
 }
 
+/// Returns the exact place as a key.
 fn key(at: Vec3) -> [u32; 3] {
     at.to_array().map(f32::to_bits)
 }
 
-/// Returns joints, weights and places on the bones of a vertex.
+/// Returns the joints that carry a vertex, their weights (sum 1) and the vertex relative to each joint's origin, canonical metres.
 pub(crate) fn bones(model: &BodyModel, template: &Template, vertex: usize) -> Vec<(usize, f64, DVec3)> {
     let (point, skin) = (template.positions[vertex].as_dvec3(), &template.skin[vertex]);
     let total: f64 = skin.weights.iter().filter(|w| **w > 0.0).map(|w| f64::from(*w)).sum();
@@ -90,7 +92,7 @@ pub(crate) fn bones(model: &BodyModel, template: &Template, vertex: usize) -> Ve
         .collect()
 }
 
-/// Returns normal and offset on the undistorted plane of a line through a pixel of the image, by its normal in the image.
+/// Returns normal and offset on the undistorted plane of the line through a pixel with a normal in the image.
 pub(crate) fn undistorted_line(camera: &Camera, view: &View, through: DVec2, normal: DVec2) -> Option<(DVec2, f64)> {
     let (on, beyond) = (view.undistorted(camera, through)?, view.undistorted(camera, through + normal)?);
     let normal = (beyond - on).normalize_or_zero();

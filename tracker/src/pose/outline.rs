@@ -1,4 +1,7 @@
-//! Where the outline of the posed body has to move to lie on the outline of a mask.
+//! Matches of the posed body's outline with the outline of a mask.
+//!
+//! Rim vertices (normal across the line of sight, body ends beside them) are thinned to one per cell and matched with the nearest
+//! end of the mask along the outline's normal.
 
 use flyrig_body::Template;
 use flyrig_types::{Camera, Mask};
@@ -9,14 +12,14 @@ use crate::masks::gate::drawn_body;
 use crate::pose::body_model::BodyModel;
 use crate::pose::line_point::{LineKind, LinePoint, bones, undistorted_line};
 
-/// A vertex is on the rim where the angle between its normal and the image plane has a smaller sine.
+/// Largest sine of the angle between a rim vertex's normal and the image plane.
 const RIM_SINE: f64 = 0.4;
-/// Distance between the chosen rim points, metres at the body.
+/// Spacing of the chosen rim points, metres at the body.
 const SPACING_M: f64 = 0.025;
-/// The body must have ended this many pixels outside of a rim point.
+/// Distances outside a rim point at which the image must not show the body, pixels.
 const CLEAR_PX: [f64; 2] = [2.5, 5.0];
 
-/// A posed body and the camera that sees it.
+/// Posed body in front of a camera.
 pub(crate) struct SeenBody<'a> {
     pub camera: &'a Camera,
     pub view: &'a View,
@@ -28,8 +31,8 @@ pub(crate) struct SeenBody<'a> {
 }
 
 impl SeenBody<'_> {
-    /// Returns points on the body's outline for which the mask ends within `reach_m` along the outline's normal. Ends of
-    /// the mask at the image's border are no outline. `sigma_m` is the standard deviation of their distance from the mask's.
+    /// Matches points on the body's outline with the mask's within `reach_m` metres along the outline's normal. Ends of the mask at the
+    /// image's border are ignored. `sigma_m` is the standard deviation of the distance, metres.
     pub fn match_mask(&self, mask: &Mask, view: usize, reach_m: f64, sigma_m: f64) -> Vec<LinePoint> {
         let Some((bounds, body)) = drawn_body(self.camera, self.vertices, &self.template.triangles, 8.0) else {
             return Vec::new();
@@ -40,7 +43,7 @@ impl SeenBody<'_> {
             let inside = x >= 0.0 && y >= 0.0 && (x as usize) < body.width && (y as usize) < body.height;
             inside && body.values[y as usize * body.width + x as usize] > 0.5
         };
-        // One point a cell, so that dense parts of the mesh (face, hands) do not outvote the others.
+        // One point per cell, so that dense parts of the mesh (face, hands) do not outweigh the others.
         let mut cells: std::collections::BTreeMap<(i64, i64), (f64, usize, DVec2, DVec2)> = Default::default();
         let (width, height) = (f64::from(mask.width()), f64::from(mask.height()));
         for (vertex, (position, normal)) in self.vertices.iter().zip(self.normals).enumerate() {
@@ -86,7 +89,7 @@ impl SeenBody<'_> {
     }
 }
 
-/// Returns the place nearest to `at` along a direction, within `reach` pixels, where the mask ends.
+/// Returns the end of the mask nearest to `at` along a direction, within `reach` pixels.
 fn mask_end(mask: &Mask, at: DVec2, direction: DVec2, reach: f64) -> Option<DVec2> {
     let value = |t: f64| coverage(mask, at + direction * t);
     let ends = |t: f64| -> Option<f64> {
@@ -104,7 +107,7 @@ fn mask_end(mask: &Mask, at: DVec2, direction: DVec2, reach: f64) -> Option<DVec
     None
 }
 
-/// Bilinear coverage, 0..=1; `None` outside of the mask.
+/// Samples the coverage bilinearly, 0..=1; `None` outside the mask.
 fn coverage(mask: &Mask, at: DVec2) -> Option<f64> {
     let (width, height) = (mask.width() as usize, mask.height() as usize);
     if !(at.x >= 0.0 && at.y >= 0.0 && at.x < width as f64 - 1.0 && at.y < height as f64 - 1.0) {

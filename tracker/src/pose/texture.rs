@@ -1,8 +1,8 @@
-//! The brightness of the body's surface as each camera has seen it, and where the body has to move to show it there again.
+//! Remembered brightness of the body's surface per camera, and the motion of the body that shows it there again.
 //!
-//! Landmarks of a network scatter anew in every set. The surface does not: a fold or a stripe stays on its place on the body, so
-//! its motion in the images is that of the bones. Each camera remembers its own brightness of each point, so neither
-//! differences between cameras nor light that comes from one side disturb the comparison.
+//! Landmarks of a network scatter anew in every frame set. The surface does not: a fold or a stripe keeps its place on the body, so
+//! its motion in the images is that of the bones. Each camera remembers its own brightness of each point, so that neither
+//! differences between cameras nor light from one side disturb the comparison.
 
 use flyrig_body::Template;
 use flyrig_types::{Camera, Mask};
@@ -16,48 +16,48 @@ use crate::pose::line_point::{LineKind, LinePoint, bones, undistorted_line};
 
 /// Distance between neighbouring points on the rest surface, metres.
 const SPACING_M: f64 = 0.03;
-/// Size of a cell of the smoothed image at the body, metres; never less than a pixel.
+/// Size of a cell of the smoothed image at the body, metres; at least a pixel.
 const CELL_M: f64 = 0.004;
-/// A surface that is seen at an angle with a smaller cosine is too near to an outline.
+/// Least cosine between a surface's normal and the line of sight: below, it is too near to an outline.
 const FACING: f64 = 0.35;
-/// Points this much farther from the camera than the nearest one in their cell are hidden, metres.
+/// Depth behind the nearest point in a cell beyond which points are hidden, metres.
 const HIDDEN_M: f64 = 0.04;
 /// Side of a cell in which points hide each other, metres.
 const HIDING_CELL_M: f64 = 0.025;
-/// Most cells across a body: one that fills more of the camera's plane stands at the lens.
+/// Largest number of cells across a body: one that fills more of the camera's plane stands at the lens.
 const MOST_CELLS: f64 = 2000.0;
-/// Standard deviation of the brightness of a point from set to set, 0..1: noise, folds, light.
+/// Standard deviation of a point's brightness between frame sets, 0..=1: noise, folds, light.
 const SIGMA: f64 = 0.06;
-/// No line is known better than this, cells of the smoothed image.
+/// Least standard deviation of a line, cells of the smoothed image.
 const SIGMA_CELLS: f64 = 0.3;
-/// Lines that are known less well are left out, cells.
+/// Largest standard deviation of a line that is used, cells.
 const VAGUE_CELLS: f64 = 4.0;
-/// How far from its place a surface is expected, cells: so far its slope predicts its brightness.
+/// Expected displacement of a surface, cells: a mismatch of slopes counts over this distance.
 const DOUBT_CELLS: f64 = 1.0;
-/// Share of a new brightness in what is remembered, once a point was seen twice. A slow memory would keep the errors of the pose
-/// in which it was learnt.
+/// Share of a new brightness in the memory, once a point was seen twice. A slow memory would keep the errors of the pose in which it
+/// was learnt.
 const LEARN: f64 = 0.6;
-/// A point that was hidden for longer is relearnt, seconds: it comes back in other light.
+/// Time after which a hidden point is relearnt, seconds: it reappears in other light.
 const FORGET_SECS: f64 = 0.5;
-/// Coverage of the mask from which on a pixel is surely the person.
+/// Least coverage of a pixel that surely shows the person.
 const SURE_COVERAGE: u8 = 230;
 
-/// Images of a body's brightness, from far to near.
+/// Number of image levels, from the widest filter to the narrowest.
 pub(crate) const LEVELS: usize = 2;
-/// Radius of their filters, cells: the wider, the farther a surface may be from its place.
+/// Radius of each level's filter, cells: the wider, the farther a surface may be from its place.
 const SMOOTH: [usize; LEVELS] = [2, 1];
 
-/// An image's brightness around the body, smoothed.
+/// Smoothed brightness of an image around the body.
 #[derive(Debug, Clone)]
 pub(crate) struct Brightness {
     origin: DVec2,
-    /// Pixels of the image in a cell.
+    /// Side of a cell, pixels of the image.
     cell: usize,
     grid: Grid,
 }
 
 impl Brightness {
-    /// Of the part of an image that shows the vertices, with a margin. `None` when nothing of them is in the image.
+    /// Smooths the part of an image that shows the vertices (world metres), with a margin. `None` when they are out of the image.
     pub fn around(picture: &Rgb<'_>, camera: &Camera, view: &View, vertices: &[Vec3]) -> Option<[Self; LEVELS]> {
         let (mut low, mut high) = (DVec2::INFINITY, DVec2::NEG_INFINITY);
         let mut scales = Vec::new();
@@ -90,12 +90,12 @@ impl Brightness {
             }
             *value = sum * norm;
         }
-        // The middle of a cell's pixels is where its value belongs.
+        // A cell's value belongs to the middle of its pixels.
         let origin = DVec2::new((x0 * cell) as f64, (y0 * cell) as f64) + 0.5 * (cell as f64 - 1.0);
         Some(SMOOTH.map(|radius| Self { origin, cell, grid: grid.box_mean(radius).box_mean(radius) }))
     }
 
-    /// Brightness at a pixel, 0..1.
+    /// Returns the brightness at a pixel, 0..=1.
     fn value(&self, pixel: DVec2) -> Option<f64> {
         let at = (pixel - self.origin) / self.cell as f64;
         let grid = &self.grid;
@@ -110,7 +110,7 @@ impl Brightness {
         Some(top + (bottom - top) * fy)
     }
 
-    /// Brightness and its change for each pixel of the image.
+    /// Returns the brightness, 0..=1, and its gradient per pixel of the image.
     fn slope(&self, pixel: DVec2) -> Option<(f64, DVec2)> {
         let step = self.cell as f64;
         let change = |d: DVec2| Some((self.value(pixel + d)? - self.value(pixel - d)?) / (2.0 * step));
@@ -122,13 +122,13 @@ impl Brightness {
 /// Brightness of a point in earlier images of one camera.
 #[derive(Debug, Clone, Copy)]
 struct Remembered {
-    /// By level, 0..1 and its change for each pixel.
+    /// Brightness of each level, 0..=1, and its gradient per pixel.
     levels: [(f64, DVec2); LEVELS],
     sets: u32,
     nanos: i64,
 }
 
-/// The body in front of one camera.
+/// Skinned body in front of one camera.
 pub(crate) struct TexturedBody<'a> {
     pub camera: &'a Camera,
     pub view: &'a View,
@@ -137,17 +137,17 @@ pub(crate) struct TexturedBody<'a> {
     pub normals: &'a [Vec3],
 }
 
-/// The brightness of points on the body, by camera.
+/// Remembered brightness of points on the body, per camera.
 #[derive(Debug, Clone, Default)]
 pub(crate) struct Texture {
     /// Vertices of the points.
     points: Vec<usize>,
-    /// By slot, then by point.
+    /// Memory of each slot and point.
     seen: Vec<Vec<Option<Remembered>>>,
 }
 
 impl Texture {
-    /// Of a template's surface and nothing seen yet.
+    /// Chooses points on a template's surface, without any memory.
     pub fn new(template: &Template, slots: usize) -> Self {
         let mut cells = std::collections::BTreeMap::new();
         for (vertex, position) in template.positions.iter().enumerate() {
@@ -159,7 +159,7 @@ impl Texture {
         Self { points, seen }
     }
 
-    /// Returns the points that are remembered and visible, and the lines in the image on which they have the same brightness.
+    /// Returns the remembered and visible points with the image lines on which they have the same brightness.
     pub fn lines(
         &self,
         (template, model): (&Template, &BodyModel),
@@ -174,7 +174,7 @@ impl Texture {
             let Some(remembered) = seen[index] else { continue };
             let Some((value, slope)) = image.slope(pixel) else { continue };
             let (value_before, slope_before) = remembered.levels[level];
-            // Where the image changes in another way than the surface does, it shows another surface or is far from its place.
+            // Where the slopes disagree, the image shows another surface, or the surface is far from its place.
             let other = DOUBT_CELLS * image.cell as f64 * (slope - slope_before).length();
             let slope = 0.5 * (slope + slope_before);
             let steepness = slope.length();
@@ -209,7 +209,7 @@ impl Texture {
         lines
     }
 
-    /// Takes in what a camera sees of the body in its accepted pose.
+    /// Learns the brightness of the body in its accepted pose from one camera. `nanos` is the frame set's time.
     pub fn learn(
         &mut self,
         body: &TexturedBody<'_>,
@@ -242,7 +242,7 @@ impl Texture {
         }
     }
 
-    /// Points that a camera sees, with their pixels.
+    /// Returns the points that a camera sees, with their pixels.
     fn visible(&self, body: &TexturedBody<'_>) -> Vec<(usize, DVec2)> {
         let eye = body.view.center();
         let Some(nearest) = Nearest::new(body) else { return Vec::new() };
@@ -269,7 +269,7 @@ struct Nearest {
 }
 
 impl Nearest {
-    /// `None` when the body is not in front of the camera, or fills an absurd part of its plane.
+    /// Draws the depths; `None` when the body is not in front of the camera, or fills an absurd part of its plane.
     fn new(body: &TexturedBody<'_>) -> Option<Self> {
         let places: Vec<(DVec2, f64)> =
             body.vertices.iter().filter_map(|vertex| place(body.view, vertex.as_dvec3())).collect();
@@ -305,7 +305,7 @@ impl Nearest {
     }
 }
 
-/// Undistorted pixels and depth of a point.
+/// Returns undistorted pixels from the principal point and depth in metres of a world point.
 fn place(view: &View, point: DVec3) -> Option<(DVec2, f64)> {
     let p = view.to_camera(point)?;
     Some((p.truncate() * (view.focal_px / p.z), p.z))

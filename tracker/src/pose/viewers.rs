@@ -1,4 +1,6 @@
 //! Pose estimation in each camera independently, so that wrong timestamps and extrinsics do not affect the result.
+//!
+//! The calibration from a person and `flyrig sync-check` use it.
 
 use std::sync::Arc;
 
@@ -12,17 +14,17 @@ use crate::pose::config::PoseConfig;
 use crate::pose::estimate::PoseEstimate;
 use crate::pose::estimator::PoseEstimator;
 
-/// One pose estimator per camera.
+/// One pose estimator of a single person per camera.
 #[derive(Debug, Clone)]
 pub struct Viewers {
     alone: Vec<PoseEstimator>,
-    /// Uses all cameras; locates the person for a camera that fails alone.
+    /// Estimator with all cameras, which locates the person for a camera that fails alone.
     together: PoseEstimator,
     sets: u64,
 }
 
 impl Viewers {
-    /// Creates estimators for one person. `plates` are images of the empty scene by slot.
+    /// Creates estimators for one person. `plates` are images of the empty scene in rig order.
     ///
     /// # Errors
     /// Those of [`PoseEstimator::new`] and [`PoseEstimator::set_plate`].
@@ -48,8 +50,8 @@ impl Viewers {
         Ok(Self { alone, together: PoseEstimator::new(net.clone(), template, rig, together)?, sets: 0 })
     }
 
-    /// Estimates the pose in each image of a set independently. Timestamps matter only for locating a person whom a camera does not find
-    /// alone. Returns `None` for slots without an image or a person.
+    /// Estimates the pose in each image of a frame set independently. Timestamps matter only to locate a person whom a camera does not
+    /// find alone. Returns `None` for slots without an image or a person.
     ///
     /// # Errors
     /// Those of [`PoseEstimator::estimate`] but `Lost`.
@@ -84,7 +86,7 @@ impl Viewers {
     }
 }
 
-/// Estimates the pose in one image; `None` when nobody is found.
+/// Estimates the pose in one image; `None` when no person is found.
 fn estimate_alone(
     estimator: &mut PoseEstimator,
     frame: &Arc<Frame>,

@@ -1,4 +1,4 @@
-//! Parameters of a body's shape, and the template that they make.
+//! Shape space of a body: scale, lengths, girths and targets, their prior among people, and the template of each shape.
 
 use std::collections::BTreeMap;
 
@@ -17,7 +17,7 @@ const GIRTH_SIGMA: f64 = 0.1;
 /// Standard deviation of a target of the built-in body, whose values lie in 0..=1.
 const TARGET_SIGMA: f64 = 0.25;
 
-/// Groups of bones whose length varies: shared by both sides.
+/// Groups of bones whose length varies, shared by both sides.
 pub(crate) const LENGTHS: [&str; 8] =
     ["trunk", "shoulders", "hips", "upper-arms", "forearms", "thighs", "shanks", "feet"];
 /// Parts whose girth varies: the trunk from front to back, limbs around their bones, the head as a whole.
@@ -33,11 +33,12 @@ pub(crate) struct ShapeSpace {
 }
 
 impl ShapeSpace {
+    /// Returns the shape space of a template; targets exist for the built-in body only.
     pub fn new(base: &Template) -> Self {
         Self { base: base.clone(), has_targets: base.is_built_in() }
     }
 
-    /// Name, mean and standard deviation of each parameter among people.
+    /// Returns name, mean and standard deviation of each parameter among people.
     pub fn prior(&self) -> Vec<(&'static str, f64, f64)> {
         let of = |names: &'static [&'static str], mean: f64, sigma: f64| names.iter().map(move |n| (*n, mean, sigma));
         std::iter::once(("scale", 1.0, SCALE_SIGMA))
@@ -47,16 +48,16 @@ impl ShapeSpace {
             .collect()
     }
 
-    /// Keeps a parameter where there are bodies.
+    /// Clamps a parameter to the range in which bodies exist.
     pub fn clamped(index: usize, value: f64) -> f64 {
         let is_target = index > LENGTHS.len() + GIRTHS.len();
         if is_target { value.clamp(0.0, 0.99) } else { value.clamp(0.4, 1.6) }
     }
 
-    /// The template of a shape.
+    /// Returns the template of a shape.
     ///
     /// # Errors
-    /// Kind `Template` when there is no such body.
+    /// Kind `Template` when no such body exists.
     pub fn template(&self, values: &[f64]) -> Result<Template, TrackError> {
         let named: BTreeMap<&str, f64> = self.prior().iter().zip(values).map(|((name, ..), v)| (*name, *v)).collect();
         let shaped;
@@ -73,7 +74,7 @@ impl ShapeSpace {
     }
 }
 
-/// How each joint's flesh is stretched, canonical axes, before the whole-body scale.
+/// Returns the stretch of each joint's flesh, canonical axes, before the whole-body scale.
 fn stretches(model: &BodyModel, factors: &BTreeMap<String, f64>) -> Vec<DMat3> {
     let factor = |name: &str| factors.get(name).copied().unwrap_or(1.0);
     let mut stretch = vec![DMat3::IDENTITY; model.parents.len()];
@@ -130,8 +131,11 @@ fn stretches(model: &BodyModel, factors: &BTreeMap<String, f64>) -> Vec<DMat3> {
     stretch
 }
 
-/// Stretches a template by factors named as in [`LENGTHS`] and [`GIRTHS`], and `scale`; those that are not named are 1.
-/// Vertices move with the bones that carry them.
+/// Stretches a template by factors named as in [`LENGTHS`] and [`GIRTHS`], and `scale`; missing ones are 1. Vertices move with the
+/// bones that carry them.
+///
+/// # Errors
+/// Kind `Template` when the fitted skeleton is not valid.
 pub(crate) fn scale_template(
     template: &Template,
     model: &BodyModel,

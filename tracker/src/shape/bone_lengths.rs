@@ -1,4 +1,4 @@
-//! Bone lengths of the person, and the template with them.
+//! Bone lengths of a person from triangulated landmarks, and the template with them.
 
 use std::collections::BTreeMap;
 
@@ -13,11 +13,11 @@ use crate::pose::body_model::BodyModel;
 use crate::pose::config::PoseConfig;
 use crate::shape::body_shape::{ShapeSpace, scale_template};
 
-/// Lengths are pulled towards the template's proportions as if those were this many measurements.
+/// Weight of the template's proportions, in measurements of a length.
 const PRIOR_COUNT: f64 = 2.0;
-/// Proportions of adults differ from the template's by no more than this.
+/// Range of the proportions of adults relative to the template's.
 const GROUP_RANGE: (f64, f64) = (0.8, 1.25);
-/// Whole-body scale that is believed.
+/// Plausible range of the whole-body scale.
 const SCALE_RANGE: (f64, f64) = (0.4, 1.6);
 
 /// Length groups: name and the pairs of landmarks whose distance measures it.
@@ -37,15 +37,15 @@ const GROUPS: [(&str, &[(usize, usize)]); 8] = [
 pub struct ShapeFit {
     /// Scale of the whole body.
     pub scale: f64,
-    /// Length factor of each group of bones on top of `scale`, by name.
+    /// Length factor of each group of bones in addition to `scale`, by name.
     pub groups: BTreeMap<String, f64>,
     /// Standard deviation of `scale` and of each factor, by name; empty where only distances between landmarks were used.
     pub sigma: BTreeMap<String, f64>,
     /// Stature of the fitted template in its bind pose, metres.
     pub height_m: f64,
-    /// Frame sets that gave at least one length.
+    /// Number of frame sets that measured at least one length.
     pub sets: usize,
-    /// Where the height comes from.
+    /// Source of the height.
     pub height_from: HeightFrom,
     /// Clothes of the person.
     pub outfit: Outfit,
@@ -58,9 +58,9 @@ pub enum HeightFrom {
     Measurement,
     /// [`PoseConfig::height_m`].
     Configuration,
-    /// Where the feet stand before a single camera, for a floor at this height ([`PoseConfig::floor_m`]).
+    /// Place of the feet before a single camera, for a floor at this height in metres ([`PoseConfig::floor_m`]).
     Floor(f64),
-    /// The template's: one camera cannot tell a tall person from a near one.
+    /// Template: a single camera cannot distinguish a tall person from a near one.
     Average,
 }
 
@@ -84,12 +84,12 @@ impl std::fmt::Display for ShapeFit {
 }
 
 impl ShapeFit {
-    /// A factor by name, `scale` included.
+    /// Returns a factor by name, `scale` included.
     pub(crate) fn factor(&self, name: &str) -> Option<f64> {
         if name == "scale" { Some(self.scale) } else { self.groups.get(name).copied() }
     }
 
-    /// Takes over a solution.
+    /// Stores a solution of the shape space.
     pub(crate) fn set(&mut self, space: &ShapeSpace, values: &[f64], sigma: &[f64], template: &Template) {
         for (((name, ..), value), sigma) in space.prior().iter().zip(values).zip(sigma) {
             if *name == "scale" {
@@ -103,16 +103,15 @@ impl ShapeFit {
     }
 }
 
-/// Scales a template to a person: the whole body, and each group of bones along its own direction, from
-/// the median distances between triangulated landmarks over a few frame sets.
+/// Scales a template to a person: the whole body, and each group of bones along its own direction, by the median distances between
+/// triangulated landmarks over a few frame sets.
 ///
-/// `keypoints[set][slot]` are the landmarks of one person, slots in rig order. Needs two views in at least
-/// one set. Vertices move with the bones that carry them, so flesh keeps its thickness apart from `scale`.
+/// `keypoints[set][slot]` are the landmarks of one person, slots in rig order. Needs two views in at least one frame set. Vertices
+/// move with the bones that carry them, so that flesh keeps its thickness apart from `scale`.
 ///
 /// # Errors
-/// Kind `Lost` when too few lengths could be measured or they are not a person's; kind `Template` when the
-/// template lacks joints.
-pub fn fit_template_shape(
+/// Kind `Lost` when too few lengths were measured or they are implausible; kind `Template` when the template lacks joints.
+pub(crate) fn fit_template_shape(
     template: &Template,
     rig: &Rig,
     keypoints: &[Vec<Option<ViewKeypoints>>],
@@ -135,7 +134,7 @@ pub fn fit_template_shape(
         sets += usize::from(any);
     }
     let rest = |a: usize, b: usize| (model.marks[a].point - model.marks[b].point).length();
-    // Measured over the template's, with the count of measurements.
+    // Ratio of measured to template length, and the number of measurements.
     let ratios: Vec<Option<(f64, f64)>> = GROUPS
         .iter()
         .zip(&mut lengths)
@@ -145,7 +144,7 @@ pub fn fit_template_shape(
             median(lengths).map(|measured_m| (measured_m / template_m, count))
         })
         .collect();
-    // Long bones tell the stature; widths and feet do not.
+    // Long bones determine the stature; widths and feet do not.
     const STATURE: [(usize, f64); 5] = [(0, 2.0), (3, 1.0), (4, 1.0), (5, 2.0), (6, 2.0)];
     let (sum, weight) = STATURE
         .iter()
@@ -194,7 +193,7 @@ pub fn fit_template_shape(
     Ok((shaped, fit))
 }
 
-/// Returns a template of a given height in metres, or as it is where none is known.
+/// Returns a template of a height in metres, unscaled where none is known.
 pub(crate) fn template_of_height(
     template: &Template,
     height: Option<f64>,
@@ -207,14 +206,14 @@ pub(crate) fn template_of_height(
     Ok((shaped, ShapeFit { scale, groups, sigma, height_m, sets: 0, height_from, outfit: Outfit::default() }))
 }
 
-/// Height of a template in its bind pose, metres.
+/// Returns the height of a template in its bind pose, metres.
 pub(crate) fn height_m(template: &Template) -> f64 {
     let heights = template.positions.iter().map(|p| f64::from(p.y));
     let (low, high) = heights.fold((f64::INFINITY, f64::NEG_INFINITY), |(low, high), y| (low.min(y), high.max(y)));
     high - low
 }
 
-/// Median landmark count that a set needs to be worth a shape fit.
+/// Returns the number of landmarks that at least two views see.
 pub(crate) fn seen_landmarks(views: &[Option<ViewKeypoints>], threshold: f64) -> usize {
     let seen = |i: usize| {
         views.iter().flatten().filter(|view| view[i].usable() && view[i].confidence >= threshold).count() >= 2

@@ -1,4 +1,7 @@
-//! Whether a person wears shoes, and a skirt or a long coat, from masks.
+//! Detection of shoes, and of a skirt or a long coat, from masks.
+//!
+//! Clothes are tried on the posed body, and accepted where they raise the overlap with the masks of several frame sets enough. Poses
+//! stay those of the body; the dressed body is drawn.
 
 use flyrig_body::{Outfit, Part, Shoes, Skirt, Template, skin_mesh};
 use flyrig_types::{Camera, Mask, Pose};
@@ -7,56 +10,55 @@ use rayon::prelude::*;
 
 use crate::image::grid::Grid;
 
-/// Masks are compared in squares of this size, metres at the body: for skirts, and around the feet for shoes.
+/// Side of the squares in which masks are compared, metres at the body: for skirts, and around the feet for shoes.
 const SQUARE_M: f64 = 0.015;
 const FOOT_SQUARE_M: f64 = 0.004;
-/// Lengths that are tried, then lengths between them, and flares.
+/// Skirt lengths that are tried, the refinement between them, and flares.
 const LENGTHS: [f32; 6] = [0.3, 0.42, 0.54, 0.66, 0.78, 0.9];
 const BETWEEN: f32 = 0.06;
 const FLARES: [f32; 6] = [0.0, 0.08, 0.16, 0.25, 0.35, 0.5];
 const FIRST_FLARE: f32 = 0.16;
-/// A skirt is believed when bodies in it overlap masks by so much more (intersection over union) than bodies without: wide trousers
-/// gain less.
+/// Least gain in overlap (intersection over union) by which a skirt is accepted: wide trousers gain less.
 const GAIN: f64 = 0.015;
-/// Soles that are tried, metres.
+/// Thicknesses of soles that are tried, metres.
 const SOLES_M: [f32; 5] = [0.008, 0.015, 0.022, 0.03, 0.042];
-/// Shoes are believed when bodies in them overlap the masks around the feet by so much more: thin ones gain up to 0.060 on the bare feet
-/// of real footage, and simulated shoes 0.088 and more where no coat hides them (docs/benchmarks/deform.md).
+/// Least gain in overlap around the feet by which shoes are accepted: thin ones gain up to 0.060 on the bare feet of real footage, and
+/// simulated shoes 0.088 and more where no coat hides them (docs/benchmarks/deform.md).
 const SHOES_GAIN: f64 = 0.065;
-/// Distance around the feet that counts for shoes, metres.
+/// Distance around the feet within which masks are compared, metres.
 const AROUND_FEET_M: f64 = 0.05;
 
-/// A person in one image.
+/// Person in one image.
 #[derive(Debug, Clone, Copy)]
 pub struct MaskedView<'a> {
-    /// The camera.
+    /// Camera.
     pub camera: &'a Camera,
-    /// Which of [`MaskedPoses::poses`] the person has.
+    /// Index of the person's pose in [`MaskedPoses::poses`].
     pub pose: usize,
-    /// Coverage by the person.
+    /// Mask of the person, at the image's size.
     pub mask: &'a Mask,
 }
 
-/// A person in several images.
+/// Person in several images.
 #[derive(Debug, Clone, Default)]
 pub struct MaskedPoses<'a> {
     /// Poses of the body, world frame.
     pub poses: Vec<Pose>,
-    /// Images that show it in one of them.
+    /// Images that show the person in one of the poses.
     pub views: Vec<MaskedView<'a>>,
 }
 
-/// A mask in squares, and how many pixels a square has a side.
+/// Mask reduced to squares.
 struct Target<'a> {
     view: &'a MaskedView<'a>,
     squares: Grid,
     side_px: f64,
-    /// First and last column and row of the squares that count, the last excluded.
+    /// Columns and rows of the compared squares: left, right, top, bottom (right and bottom excluded).
     counted: [usize; 4],
 }
 
 impl<'a> Target<'a> {
-    /// `None` where nothing of the person is before the camera.
+    /// Reduces a mask to squares of `square_m` metres at the body; `None` when the person is not before the camera or the size differs.
     fn new(view: &'a MaskedView<'a>, pose: &Pose, square_m: f64) -> Option<Self> {
         if [view.mask.width(), view.mask.height()] != view.camera.size() {
             return None;
@@ -80,7 +82,7 @@ impl<'a> Target<'a> {
         Some(Self { view, squares: sums, side_px, counted })
     }
 
-    /// Lets only the surroundings of some world points count; `None` where the camera sees none of them.
+    /// Restricts the comparison to the surroundings of world points (metres); `None` where the camera sees none of them.
     fn around(self, points: impl Iterator<Item = Vec3>, reach_m: f64) -> Option<Self> {
         let (mut low, mut high) = (DVec2::INFINITY, DVec2::NEG_INFINITY);
         for point in points.map(Vec3::as_dvec3) {
@@ -96,7 +98,7 @@ impl<'a> Target<'a> {
         (counted[0] < counted[1] && counted[2] < counted[3]).then_some(Self { counted, ..self })
     }
 
-    /// Squares that both cover, and squares that either covers.
+    /// Returns the number of compared squares that body and mask both cover, and of those that either covers.
     fn overlap(&self, vertices: &[Vec3], triangles: &[[u32; 3]]) -> (usize, usize) {
         let place = |v: &Vec3| Some((self.view.camera.project(v.as_dvec3())? + 0.5) / self.side_px - 0.5);
         let pixels: Vec<Option<DVec2>> = vertices.iter().map(place).collect();
@@ -117,11 +119,12 @@ impl<'a> Target<'a> {
     }
 }
 
+/// Reduces all masks to squares.
 fn targets<'a>(seen: &'a MaskedPoses<'_>, square_m: f64) -> impl Iterator<Item = Target<'a>> {
     seen.views.iter().filter_map(move |view| Target::new(view, seen.poses.get(view.pose)?, square_m))
 }
 
-/// Intersection over union of masks with a body in its poses; 0 for clothes that it cannot wear.
+/// Returns the intersection over union of masks with a dressed body in its poses; 0 for clothes that it cannot wear.
 fn overlap(targets: &[Target<'_>], poses: &[Pose], dressed: Result<Template, flyrig_body::BodyError>) -> f64 {
     let Ok(dressed) = dressed else { return 0.0 };
     let skinned: Vec<Vec<Vec3>> = poses.par_iter().map(|pose| skin_mesh(&dressed, pose).0).collect();
@@ -132,8 +135,8 @@ fn overlap(targets: &[Target<'_>], poses: &[Pose], dressed: Result<Template, fly
 }
 
 /// Returns the outfit in which the body covers the masks best, by intersection over union of all views: shoes where they do better than
-/// bare feet, a skirt where it does better than trousers. Nothing for a body that carries none. Views of poses that do not exist, and
-/// masks of another size than their camera's images, count nothing.
+/// bare feet, a skirt where it does better than trousers; nothing for a body that cannot wear any. Views of missing poses and masks of
+/// another size than their camera's images are ignored.
 #[must_use]
 pub fn find_outfit(body: &Template, seen: &MaskedPoses<'_>) -> Outfit {
     let shoes = find_shoes(body, seen);
@@ -141,6 +144,7 @@ pub fn find_outfit(body: &Template, seen: &MaskedPoses<'_>) -> Outfit {
     Outfit { skirt: find_skirt(body, bare, seen), ..bare }
 }
 
+/// Finds the shoes that raise the overlap around the feet.
 fn find_shoes(body: &Template, seen: &MaskedPoses<'_>) -> Option<Shoes> {
     let on_foot = |vertex: usize| matches!(body.parts.get(vertex), Some(Part::LeftFoot | Part::RightFoot));
     let feet: Vec<Vec<Vec3>> = seen
@@ -170,6 +174,7 @@ fn find_shoes(body: &Template, seen: &MaskedPoses<'_>) -> Option<Shoes> {
     (gain - bare > SHOES_GAIN).then_some(best)
 }
 
+/// Finds the skirt that raises the overlap of a body in `worn`.
 fn find_skirt(body: &Template, worn: Outfit, seen: &MaskedPoses<'_>) -> Option<Skirt> {
     let targets: Vec<Target<'_>> = targets(seen, SQUARE_M).collect();
     if targets.is_empty() {

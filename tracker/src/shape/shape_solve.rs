@@ -1,4 +1,6 @@
-//! Shape of a body and its poses in several frame sets, solved together.
+//! Joint least squares of a body's shape and its poses in several frame sets.
+//!
+//! Poses are eliminated by the Schur complement, derivatives by the shape are finite differences of the template.
 
 use flyrig_body::Template;
 use flyrig_solve::{ArrowNormal, Convergence, DenseNormal, EliminatedBlock, Problem, minimize};
@@ -11,36 +13,36 @@ use crate::pose::fit::{FitProblem, ShapeDerivatives};
 use crate::pose::line_point::LinePoint;
 use crate::shape::body_shape::ShapeSpace;
 
-/// Step of the derivatives by the shape's parameters.
+/// Step of the finite differences by the shape's parameters.
 const STEP: f64 = 0.01;
-/// Steps of the solver.
+/// Largest number of solver steps.
 const MAX_STEPS: usize = 6;
 
-/// A frame set as the shape is fitted to it.
+/// Measurements of one frame set.
 #[derive(Debug, Clone)]
 pub(crate) struct ShapeSet<'a> {
-    /// Landmarks and views; its model and outline are replaced.
+    /// Landmarks and views; model and outline are replaced by those of the current shape.
     pub problem: FitProblem<'a>,
-    /// Points of the body's outline with the lines they belong on.
+    /// Points of the body's outline with the image lines that they belong on.
     pub outline: Vec<LinePoint>,
 }
 
-/// Parameters of the shape, and a pose for each set.
+/// Parameters of the shape, and a pose for each frame set.
 #[derive(Debug, Clone)]
 pub(crate) struct ShapeAndPoses {
     pub shape: Vec<f64>,
     pub poses: Vec<JointTurns>,
 }
 
-/// Shape and poses that explain all sets.
+/// Fit of one shape and all poses to all frame sets.
 pub(crate) struct ShapeProblem<'a> {
     pub space: &'a ShapeSpace,
     pub sets: &'a [ShapeSet<'a>],
 }
 
 impl ShapeProblem<'_> {
-    /// Returns shape and poses better than the start, and the standard deviations of the shape's parameters; `None` when the
-    /// start makes no sense.
+    /// Returns improved shape and poses, and the standard deviations of the shape's parameters; `None` when the start has no finite
+    /// cost.
     pub fn solve(&self, start: &ShapeAndPoses) -> Option<(ShapeAndPoses, Vec<f64>)> {
         let options = Convergence { max_steps: MAX_STEPS, min_gain: 1e-3, ..Convergence::default() };
         let solution = minimize(self, start, &options)?;
@@ -49,12 +51,14 @@ impl ShapeProblem<'_> {
         Some((solution.unknowns, sigma))
     }
 
+    /// Returns template and model of a shape.
     fn model(&self, shape: &[f64]) -> Option<(Template, BodyModel)> {
         let template = self.space.template(shape).ok()?;
         let model = BodyModel::new(&template).ok()?;
         Some((template, model))
     }
 
+    /// Calls `then` with the fit of one frame set to the body of a shape.
     fn with_set<T>(
         set: &ShapeSet<'_>,
         template: &Template,
@@ -68,11 +72,12 @@ impl ShapeProblem<'_> {
         then(&FitProblem { model, lines: &outline, ..set.problem.clone() })
     }
 
+    /// Returns the derivatives of a model by the parameters of its shape.
     fn derivatives(&self, shape: &[f64], template: &Template, model: &BodyModel) -> Option<ShapeDerivatives> {
         let columns: Vec<_> = (0..shape.len())
             .into_par_iter()
             .map(|k| {
-                // Towards the middle of the range, where there are bodies.
+                // Towards the middle of the range, where bodies exist.
                 let step = if ShapeSpace::clamped(k, shape[k] + STEP) > shape[k] + 0.5 * STEP { STEP } else { -STEP };
                 let mut moved = shape.to_vec();
                 moved[k] += step;
@@ -102,6 +107,7 @@ impl ShapeProblem<'_> {
         Some(derivatives)
     }
 
+    /// Returns the residual of each parameter and its derivative.
     fn prior(&self, shape: &[f64]) -> Vec<(f64, f64)> {
         let prior = self.space.prior();
         prior.iter().zip(shape).map(|((_, mean, sigma), value)| ((value - mean) / sigma, 1.0 / sigma)).collect()

@@ -1,9 +1,9 @@
-//! From images to landmarks, and from landmarks to a pose.
+//! From images to landmarks, and from landmarks to a pose: tracking, search and the fit to landmarks.
 
 use super::*;
 
 impl PoseEstimator {
-    /// Follows the person from the last pose; searches the images where that fails.
+    /// Tracks the person from the last pose; searches the images where that fails.
     pub(super) fn follow_or_search(
         &mut self,
         set: &FrameSet,
@@ -21,7 +21,7 @@ impl PoseEstimator {
         }
         let rhythm = (self.lost / 4).clamp(1, RAREST_SEARCH);
         if !may_search || !self.lost.is_multiple_of(rhythm) {
-            return Err(TrackError::lost(format!("frame set {}: nobody here; the next search is soon", set.index)));
+            return Err(TrackError::lost(format!("frame set {}: no person here; the next search is soon", set.index)));
         }
         let start = Instant::now();
         let scene = SearchScene {
@@ -39,10 +39,10 @@ impl PoseEstimator {
             sightings.into_iter().map(|sighting| sighting.map(Inference::fresh)).collect();
         seconds.search += start.elapsed().as_secs_f64();
         if inferences.iter().all(Option::is_none) {
-            return Err(TrackError::lost(format!("frame set {}: nobody found yet; the search goes on", set.index)));
+            return Err(TrackError::lost(format!("frame set {}: no person found yet; the search goes on", set.index)));
         }
         let first = self.fit(set, inferences, None, seconds)?;
-        // Inference again through crops around the fitted body: turned upright, and in the views that chose nobody.
+        // Runs again on crops around the fitted body: upright ones, and also in the views without a choice.
         let marks = self.model.marks(&first.turns);
         let start = Track {
             turns: first.turns.clone(),
@@ -58,9 +58,9 @@ impl PoseEstimator {
         }
     }
 
-    /// The views that the network inferences at again when the body's landmarks are at `marks`.
+    /// Returns the views that are due when the body's landmarks are at `marks`.
     fn due(&self, set: &FrameSet, pictures: &[Option<Rgb<'_>>], track: &Track, marks: &Marks) -> Vec<bool> {
-        // How far somebody has moved who was seen once, nobody can predict.
+        // The motion of a person who was seen only once cannot be predicted.
         let (look_after_m, most) = match (self.infers_always || track.velocity.is_none(), self.config.max_inferences) {
             (true, _) => (0.0, usize::MAX),
             (false, 0) => (self.config.look_after_m, usize::MAX),
@@ -70,8 +70,8 @@ impl PoseEstimator {
         due(&track.inferences, has_image, marks, set.master_nanos, look_after_m, most)
     }
 
-    /// Looks after all where outlines and texture have moved the body of a set without a inference farther than was predicted;
-    /// `None` where they have not, or where the inferences agree with nobody.
+    /// Runs the network after the refinement of a frame set without an inference, in views where outlines and texture have moved the
+    /// body farther than predicted; `None` where they have not, or where the new landmarks do not fit.
     pub(super) fn infer_after_refinement(
         &self,
         set: &FrameSet,
@@ -88,7 +88,8 @@ impl PoseEstimator {
         self.follow(set, pictures, (track, &marks), others, seconds)
     }
 
-    /// One inference through crops around the landmarks where they are expected; `None` when the person is not there any more.
+    /// Runs the network on crops around the predicted landmarks where it is due, and fits the pose; `None` when the person is no longer
+    /// there.
     fn follow(
         &self,
         set: &FrameSet,
@@ -112,7 +113,7 @@ impl PoseEstimator {
         };
         let slots: Vec<usize> = (0..pictures.len()).filter(|&slot| due[slot]).collect();
         let mut inferences = track.inferences.clone();
-        for (slot, inference) in slots.iter().zip(beside_each_other(slots.len(), |at| inference(slots[at]))) {
+        for (slot, inference) in slots.iter().zip(map_parallel(slots.len(), |at| inference(slots[at]))) {
             inferences[*slot] = inference?;
         }
         seconds.net += start.elapsed().as_secs_f64();
@@ -124,6 +125,7 @@ impl PoseEstimator {
         }
     }
 
+    /// Fits the pose to the landmarks of all views, from the tracked pose or from an alignment of the trunk.
     fn fit(
         &self,
         set: &FrameSet,
@@ -154,7 +156,7 @@ impl PoseEstimator {
             let mut seen = [None; LANDMARK_COUNT];
             let mut shift = [DVec3::ZERO; LANDMARK_COUNT];
             if let Some(inference) = inferences[slot].as_ref().filter(sees) {
-                // Hidden landmarks as well: the network guesses where they are, and the fit knows how well.
+                // Hidden landmarks as well: the network estimates their place, and the fit knows how accurately.
                 seen = observe(camera, &view, &inference.sighting.keypoints, 0.0);
                 if let Some((track, predicted)) = track {
                     for (i, (carried, trust)) in inference.carried(&track.marks, predicted).into_iter().enumerate() {
@@ -171,7 +173,7 @@ impl PoseEstimator {
             return Err(lost("no view shows enough of a person"));
         }
         let mut evidence = Evidence { views, points: [None; LANDMARK_COUNT], before: None };
-        // One view alone says nothing of depth: the network's own guess at the third dimension stands in.
+        // A single view does not constrain depth: the network's own estimate of the third dimension is used.
         let triangulated = points.iter().flatten().count();
         let mut world = points.each_ref().map(|point| point.as_ref().map(|p| p.position));
         if triangulated < MIN_LANDMARKS {
@@ -196,8 +198,8 @@ impl PoseEstimator {
                 if has_news {
                     evidence.problem(&self.model, config).solve(&track.turns, config.max_steps)
                 } else {
-                    // Landmarks that were carried along say nothing new. A fit to them alone would leave what outlines and
-                    // texture have found, and masks made there follow its bias.
+                    // Carried landmarks are no new measurement. A fit to them alone would leave the place found by outlines and
+                    // texture, and masks made there would follow its bias.
                     Some((track.turns.clone(), 0))
                 }
             }
@@ -218,12 +220,12 @@ impl PoseEstimator {
         };
         seconds.fit += start.elapsed().as_secs_f64();
         let (turns, _) = turns.filter(|(turns, _)| finite(turns)).ok_or_else(|| lost("the fit has no finite cost"))?;
-        self.judge(turns, inferences, keypoints, points, evidence)
+        self.measure(turns, inferences, keypoints, points, evidence)
             .ok_or_else(|| lost("no landmark agrees with the fit"))
     }
 
-    /// Distances of the landmarks from the fitted body.
-    fn judge(
+    /// Measures residuals and quality of a fitted pose; `None` when no landmark is left.
+    fn measure(
         &self,
         turns: JointTurns,
         inferences: Vec<Option<Inference>>,

@@ -1,11 +1,14 @@
-//! Masks of the person whose pose is known.
+//! Estimation of masks around the fitted body.
+//!
+//! A view's mask joins the network's coarse mask (warped from its last inference), the background and the body's gate; without an
+//! inference that shows the person, it comes from the background and the gate alone.
 
 use super::*;
 use crate::masks::background_light::MOSTLY_KNOWN;
 use crate::masks::support::drop_unsupported;
 
 impl PoseEstimator {
-    /// Masks by slot; why there is none goes into the views' quality.
+    /// Estimates the masks, in rig order; the reason for a missing one goes into the view's quality.
     pub(super) fn masks(&self, set: &FrameSet, pictures: &[Option<Rgb<'_>>], fitted: &mut Fitted) -> Vec<Option<Mask>> {
         if !self.config.masks {
             return vec![None; pictures.len()];
@@ -41,7 +44,7 @@ impl PoseEstimator {
                         };
                         refine(picture, &coarse, inference.sighting.crop.scale(), &gate, evidence.as_ref())
                     }
-                    // The network sees nobody here, but the other cameras place the body in this image.
+                    // The network finds no person here, but the other cameras place the body in this image.
                     (None, Some(evidence))
                         if light.is_some_and(|light| light.known_share(picture.width, gate.bounds) > MOSTLY_KNOWN) =>
                     {

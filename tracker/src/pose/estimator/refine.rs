@@ -1,31 +1,32 @@
-//! The fit of the pose to masks and texture.
+//! Refinement of the pose by outlines of masks and the body's texture.
 
 use super::*;
 
-/// Farthest that the outline of a body near its place lies from the mask's, metres.
+/// Largest distance of the body's outline from the mask's that is matched in the last round, metres.
 const OUTLINE_REACH_M: f64 = 0.05;
-/// Steps of the solver in each round of matching.
+/// Solver steps per round of matching.
 const STEPS: usize = 4;
 
 /// World positions and normals of the template's vertices.
 type Skinned = (Vec<Vec3>, Vec<Vec3>);
 
-/// The body in a pose, at the set's time and at that of each view's image.
+/// Body in a pose, at the frame set's time and at that of each view's image.
 struct PosedBody {
     now: Skinned,
-    /// By view of the fit; `None` where it is the set's time.
+    /// Body at the time of each view of the fit; `None` where that is the frame set's time.
     own: Vec<Option<Skinned>>,
 }
 
 impl PosedBody {
+    /// Returns the body at the time of a view.
     fn at(&self, view: usize) -> &Skinned {
         self.own[view].as_ref().unwrap_or(&self.now)
     }
 }
 
 impl PoseEstimator {
-    /// Moves the pose so that the body's outline lies on that of the masks, and its texture where it was seen before. The
-    /// texture takes in the images.
+    /// Moves the pose so that the body's outline lies on that of the masks and its surface shows the remembered brightness; the
+    /// texture then learns from the images.
     pub(super) fn refine(
         &self,
         set: &FrameSet,
@@ -43,7 +44,7 @@ impl PoseEstimator {
         };
         let images: Vec<Option<[Brightness; LEVELS]>> = fitted.evidence.views.par_iter().map(of_view).collect();
         for round in 0..self.config.outline_rounds {
-            // Far first, then only what is near.
+            // First with a wide reach, then with a narrow one.
             let last = round + 1 >= self.config.outline_rounds;
             let mut lines = self.outline_points(fitted, &body, masks, if last { 1.0 } else { 2.0 });
             lines.extend(self.texture_points(fitted, &body, texture, &images, usize::from(last)));
@@ -67,7 +68,7 @@ impl PoseEstimator {
         turns
     }
 
-    /// The outline of the body in a pose, matched with the masks of all views.
+    /// Matches the outline of the body in a pose with the masks of all views.
     pub(super) fn match_outline(
         &self,
         set: &FrameSet,
@@ -79,6 +80,7 @@ impl PoseEstimator {
         self.outline_points(fitted, &self.posed(set, fitted, turns), masks, widen)
     }
 
+    /// Skins the body in a pose at the times of all views.
     fn posed(&self, set: &FrameSet, fitted: &Fitted, turns: &JointTurns) -> PosedBody {
         let own = |view: &FitView| {
             (view.delay_secs.abs() > MIN_DELAY_SECS).then(|| self.skinned(turns, set, view.delay_secs))
@@ -86,11 +88,12 @@ impl PoseEstimator {
         PosedBody { now: self.skinned(turns, set, 0.0), own: fitted.evidence.views.iter().map(own).collect() }
     }
 
+    /// Returns the body as one view sees its surface.
     fn textured<'a>(&'a self, view: &'a FitView, (vertices, normals): &'a Skinned) -> TexturedBody<'a> {
         TexturedBody { camera: &self.rig.cameras[view.slot], view: &view.view, vertices, normals }
     }
 
-    /// The surface of the body, matched with its brightness in all views.
+    /// Matches the surface of the body with its brightness in all views.
     fn texture_points(
         &self,
         fitted: &Fitted,
@@ -111,7 +114,7 @@ impl PoseEstimator {
         fitted.evidence.views.par_iter().enumerate().flat_map_iter(of_view).collect()
     }
 
-    /// The outline of the body, matched with the masks of all views within a multiple of the usual reach.
+    /// Matches the outline of the body with the masks of all views, within `widen` times [`OUTLINE_REACH_M`].
     fn outline_points(&self, fitted: &Fitted, body: &PosedBody, masks: &[Option<&Mask>], widen: f64) -> Vec<LinePoint> {
         let of_view = |(index, view): (usize, &FitView)| {
             let Some(mask) = masks.get(view.slot).copied().flatten() else { return Vec::new() };
@@ -132,7 +135,7 @@ impl PoseEstimator {
     }
 }
 
-/// Notes how far the points of a view move from the set's time to the image's.
+/// Sets the displacement of a view's points from the frame set's time to the image's.
 fn shift(points: &mut [LinePoint], body: &PosedBody, view: usize) {
     for point in points {
         point.shift = (body.at(view).0[point.vertex] - body.now.0[point.vertex]).as_dvec3();

@@ -1,4 +1,9 @@
-//! The person's shape: bone lengths from landmarks, and lengths, girths and build from outlines.
+//! The person's shape, fitted to about eight frame sets, while the person is tracked or beforehand.
+//!
+//! Bone lengths come from landmarks; lengths, girths and build then from landmarks and outlines, together with the poses
+//! ([`shape_solve`](crate::shape::shape_solve)). A single camera measures only the height, by where the feet stand
+//! ([`single_view`](crate::landmarks::single_view)). Shoes and a skirt are found last ([`outfit_fit`](crate::shape::outfit_fit)):
+//! joints stay those of the body, outlines are those of the feet in shoes.
 
 use super::*;
 use crate::pose::line_point::BareBody;
@@ -7,18 +12,18 @@ use crate::shape::outfit_fit::{MaskedPoses, MaskedView, find_outfit};
 use flyrig_body::Shoes;
 use flyrig_types::Camera;
 
-/// The body in shoes; bare feet where it has none to put them on.
+/// Returns the body in shoes; barefoot where it cannot wear any.
 fn shod(body: &Template, shoes: Option<Shoes>) -> Arc<Template> {
     Arc::new(Outfit { skirt: None, shoes }.on(body).unwrap_or_else(|_| body.clone()))
 }
 
-/// Heights that a single camera believes, metres.
+/// Range of plausible heights measured by a single camera, metres.
 const HEIGHTS_M: std::ops::RangeInclusive<f64> = 1.2..=2.2;
 
-/// Steps of the solver to a pose in a new shape.
+/// Solver steps to a pose in a new shape.
 const POSE_STEPS: usize = 40;
 
-/// A person as seen in one frame set, to measure the shape by.
+/// Person in one frame set, as a measurement of the shape.
 #[derive(Debug, Clone)]
 pub struct ShapeSighting {
     pub(super) set: FrameSet,
@@ -26,12 +31,12 @@ pub struct ShapeSighting {
 }
 
 impl PoseEstimator {
-    /// Fits the shape to the person in a few frame sets (5 to 10, buffered at the start; the more the person moves in them the
-    /// better) and replaces the template by the fitted one. Estimate the buffered sets again then, in order, and go on. Nobody of
-    /// `others`, landmarks by person and set, is taken for the person. Returns the person's own landmarks by set as well.
+    /// Fits the shape to the person in a few frame sets (5 to 10, buffered at the start; motion improves it) and replaces the template by
+    /// the fitted one. The buffered frame sets are then estimated again, in order. `others` holds the landmarks of other people, by
+    /// person and frame set; they are rejected. Also returns the person's own landmarks in each frame set.
     ///
     /// # Errors
-    /// Kind `Lost` when too few of the sets show a person; the template stays as it was.
+    /// Kind `Lost` when too few of the frame sets show a person; the template stays as it was.
     pub fn fit_shape(
         &mut self,
         sets: &[FrameSet],
@@ -66,13 +71,13 @@ impl PoseEstimator {
         Ok((fit, places))
     }
 
-    /// Fits the shape to a person seen in a few sets: bone lengths to the landmarks, then lengths, girths and build to landmarks
-    /// and outlines, together with the poses ([`crate::PoseConfig::shape_rounds`]). Before a single camera, which measures nothing
-    /// else, the height is the configuration's, that of somebody who stands on the floor ([`crate::PoseConfig::floor_m`]), or an average one. Goes on with the shape as it is; returns the template of
-    /// the fitted shape for [`Self::take_shape`].
+    /// Fits the shape to a person seen in a few frame sets: bone lengths to the landmarks, then lengths, girths and build to landmarks
+    /// and outlines, together with the poses ([`crate::PoseConfig::shape_rounds`]). A single camera measures only the height: the
+    /// configured one, that of a person who stands on the floor ([`crate::PoseConfig::floor_m`]), or an average one. Does not change the
+    /// estimator; returns the template of the fitted shape for [`Self::take_shape`].
     ///
     /// # Errors
-    /// Kind `Lost` when too few of the sets show a person in two views.
+    /// Kind `Lost` when too few of the frame sets show a person in two views.
     pub fn measure_shape(&self, sightings: &[ShapeSighting]) -> Result<(Template, ShapeFit), TrackError> {
         if let [camera] = self.rig.cameras.as_slice() {
             let standing = || Some((self.height_on_floor(camera, sightings)?, HeightFrom::Floor(self.config.floor_m)));
@@ -95,7 +100,7 @@ impl PoseEstimator {
         Ok((shaped.template, fit))
     }
 
-    /// Goes on tracking with a template of [`Self::measure_shape`].
+    /// Continues tracking with a template of [`Self::measure_shape`].
     ///
     /// # Errors
     /// Kind `Template` when it is not usable.
@@ -109,7 +114,7 @@ impl PoseEstimator {
         Ok(())
     }
 
-    /// Moves a body that was as tall as `before` to where the template fills the same part of a single camera's image.
+    /// Moves a body that was `before` metres tall to where the template fills the same part of a single camera's image.
     fn resized(&self, mut turns: JointTurns, before: f64) -> JointTurns {
         if let [camera] = self.rig.cameras.as_slice() {
             turns.root = camera.position().lerp(turns.root, height_m(&self.template) / before);
@@ -117,8 +122,8 @@ impl PoseEstimator {
         turns
     }
 
-    /// Height of a person whose feet stand on the floor, from one camera, metres; `None` where that is no person's height, or the
-    /// camera does not inference down on the feet.
+    /// Measures the height of a person whose feet stand on the floor, from one camera, metres; `None` for an implausible height, or
+    /// when the camera does not look down on the feet.
     fn height_on_floor(&self, camera: &Camera, sightings: &[ShapeSighting]) -> Option<f64> {
         let body = |sighting: &ShapeSighting| skin_mesh(&self.surface, &self.model.to_pose(&sighting.fitted.turns)).0;
         let bodies: Vec<Vec<Vec3>> = sightings.iter().map(body).collect();
@@ -126,7 +131,7 @@ impl PoseEstimator {
         Some(growth * height_m(&self.template)).filter(|height| HEIGHTS_M.contains(height))
     }
 
-    /// Follows the person, or searches whole images: nobody waits for the set.
+    /// Tracks the person or searches whole images at once, without spreading the search over frame sets.
     fn find_at_once(&mut self, set: &FrameSet, others: &[Marks]) -> Result<Fitted, TrackError> {
         let pictures = self.check(set)?;
         let given = (self.config.search_crops, self.infers_always);
@@ -136,7 +141,7 @@ impl PoseEstimator {
         found
     }
 
-    /// Solves for shape and poses of all sets together, from landmarks and the outlines of masks, and finds the clothes.
+    /// Solves for the shape and the poses of all frame sets together, from landmarks and outlines, and finds the clothes.
     fn fit_shape_to_outlines(&mut self, sightings: &[ShapeSighting], fit: &mut ShapeFit) -> Result<(), TrackError> {
         let mut found = Vec::new();
         for ShapeSighting { set, fitted } in sightings {
@@ -150,7 +155,7 @@ impl PoseEstimator {
             let masks = self.masks(set, &self.check(set)?, &mut fitted);
             found.push((set, fitted, masks));
         }
-        // Almost everybody wears shoes, and legs that end at their soles are too long.
+        // Most people wear shoes, and legs that reach down to the soles are too long.
         let shoes = Some(Shoes::default());
         self.solve_shape(&mut found, shoes, fit)?;
         fit.outfit = self.outfit(&found);
@@ -161,7 +166,7 @@ impl PoseEstimator {
         Ok(())
     }
 
-    /// The same of a person in given shoes.
+    /// Solves for the shape and the poses of a person in given shoes.
     fn solve_shape(
         &mut self,
         found: &mut [(&FrameSet, Fitted, Vec<Option<Mask>>)],
@@ -204,7 +209,7 @@ impl PoseEstimator {
         Ok(())
     }
 
-    /// The clothes that the masks of fitted sets show.
+    /// Returns the clothes that the masks of fitted frame sets show.
     fn outfit(&self, found: &[(&FrameSet, Fitted, Vec<Option<Mask>>)]) -> Outfit {
         let poses = found.iter().map(|(_, fitted, _)| self.model.to_pose(&fitted.turns)).collect();
         let views = found.iter().enumerate().flat_map(|(pose, (set, _, masks))| {
@@ -216,7 +221,7 @@ impl PoseEstimator {
         find_outfit(&self.template, &MaskedPoses { views: views.collect(), poses })
     }
 
-    /// Takes a template of the person's shape instead, and forgets the pose.
+    /// Replaces the template, and forgets the pose.
     ///
     /// # Errors
     /// Kind `Template` when it is not usable.
