@@ -1,8 +1,8 @@
 //! Damped least squares of one hand on the landmarks of all views.
 //!
-//! Unknown are the wrist's shift and turn relative to the body's pose and 20 angles of the fingers. The cost adds up halves
-//! of squared residuals over standard deviations: landmark distances in the images (Cauchy weights), the wrist's change,
-//! deviations of angles from the relaxed hand and from the last set, limits of angles, and the coupling of a finger's last
+//! The unknowns are shift and rotation of the wrist relative to the body's pose and 20 angles of the fingers. The cost is half the
+//! sum of squared residuals over standard deviations: landmark distances in the images (Cauchy weights), the wrist's change,
+//! deviations of angles from the relaxed hand and from the last frame set, limits of angles, and the coupling of a finger's last
 //! two joints (the last bends about two thirds as far as the one before: Lin, Wu and Huang, "Modeling the constraints of human
 //! hand motion", 2000, eq. 4).
 
@@ -16,24 +16,24 @@ use crate::hands::hand_model::{Bends, BentHand, HandModel, moving, range, relaxe
 use crate::hands::hand_net::HAND_LANDMARKS;
 use crate::hands::sight::Sight;
 
-/// Unknowns: shift, turn, four angles of five fingers.
+/// Number of unknowns: shift, rotation, four angles of five fingers.
 const SIZE: usize = 26;
 /// Standard deviation of a landmark, metres.
 const SPREAD_M: f64 = 0.006;
-/// Residuals of this many standard deviations lose half their weight.
+/// Residual at which a landmark loses half its weight, standard deviations.
 const ROBUST: f64 = 2.0;
-/// Standard deviations of the body's wrist: place in metres, turn in radians.
+/// Standard deviations of the body's wrist: place in metres, rotation in radians.
 const WRIST_SHIFT_M: f64 = 0.02;
 const WRIST_TURN_RAD: f64 = 0.35;
-/// How sharply an angle's limit is enforced, radians.
+/// Standard deviation beyond an angle's limit, radians.
 const LIMIT_RAD: f64 = 0.05;
-/// Share of the second joint's flexion that the third one follows with, and the standard deviation, radians.
+/// Flexion of the third joint as a share of the second's, and the standard deviation, radians.
 const COUPLING: f64 = 2.0 / 3.0;
 const COUPLING_RAD: f64 = 0.3;
-/// Steps of the solver.
+/// Largest number of solver steps.
 const MAX_STEPS: usize = 30;
 
-/// The landmarks of one view.
+/// Landmarks of a hand in one view.
 #[derive(Debug, Clone)]
 pub(crate) struct HandSight {
     pub sight: Sight,
@@ -41,43 +41,43 @@ pub(crate) struct HandSight {
     pub seen: [Option<DVec2>; HAND_LANDMARKS],
 }
 
-/// A hand relative to the body's pose.
+/// Hand relative to the body's pose.
 #[derive(Debug, Clone, PartialEq)]
 pub(crate) struct HandPose {
-    /// Of the wrist, world metres.
+    /// Shift of the wrist, world metres.
     pub shift: DVec3,
-    /// On the left of the wrist's rotation, world axes.
+    /// Rotation applied after the wrist's own, world axes.
     pub turn: DQuat,
     pub bends: Bends,
 }
 
 impl HandPose {
-    /// As the body has it, fingers relaxed.
+    /// Returns the hand in the body's pose with relaxed fingers.
     pub fn relaxed() -> Self {
         Self { shift: DVec3::ZERO, turn: DQuat::IDENTITY, bends: relaxed() }
     }
 }
 
-/// Data and priors of a hand.
+/// Measurements and priors of a hand.
 #[derive(Debug, Clone)]
 pub(crate) struct HandProblem<'a> {
     pub model: &'a HandModel,
     pub sights: &'a [HandSight],
-    /// Rotation of the hand's flesh from canonical axes to the world, and the wrist's place, by the body's pose.
+    /// Rotation of the hand's flesh from canonical axes to the world, and the wrist's place in metres, by the body's pose.
     pub wrist: RigidMotion,
-    /// Angles at the last set and their standard deviation since, radians.
+    /// Angles at the last frame set and the standard deviation of their change since, radians.
     pub before: Option<(Bends, f64)>,
 }
 
 impl HandProblem<'_> {
-    /// World places of the landmarks and the bent hand.
+    /// Returns the world places of the landmarks, metres, and the bent hand.
     pub fn points(&self, at: &HandPose) -> ([DVec3; HAND_LANDMARKS], BentHand) {
         let bent = self.model.bend(&at.bends);
         let (origin, rotation) = (self.wrist.translation + at.shift, at.turn * self.wrist.rotation);
         (bent.points.map(|point| origin + rotation * point), bent)
     }
 
-    /// Minimizes from a start; `None` when nothing finite is found.
+    /// Minimises from a start; returns the pose and its cost, `None` when it is not finite.
     pub fn solve(&self, start: &HandPose) -> Option<(HandPose, f64)> {
         let options = Convergence { max_steps: MAX_STEPS, min_gain: 1e-4, ..Convergence::default() };
         let solution = minimize(self, start, &options)?;
@@ -88,7 +88,7 @@ impl HandProblem<'_> {
         finite.then_some((pose, solution.cost))
     }
 
-    /// Median distance of a view's landmarks, standard deviations and pixels; `None` without any.
+    /// Returns the median residual of a view's landmarks, standard deviations and pixels; `None` without any.
     pub fn residual(&self, at: &HandPose, hand: &HandSight) -> Option<(f64, f64)> {
         let (points, _) = self.points(at);
         let (mut sigmas, mut pixels) = (Vec::new(), Vec::new());
@@ -101,7 +101,7 @@ impl HandProblem<'_> {
         Some((flyrig_solve::median(&mut sigmas)?, flyrig_solve::median(&mut pixels)?))
     }
 
-    /// Calls `each` with every residual of an angle, (index of the angle, derivative) pairs, and the residual.
+    /// Calls `each` with every residual of the angles: pairs (index of the angle, derivative), and the residual.
     fn angle_terms(&self, bends: &Bends, mut each: impl FnMut(&[(usize, f64)], f64)) {
         for (finger, angles) in bends.iter().enumerate() {
             for (k, &angle) in angles.iter().enumerate() {
@@ -126,8 +126,8 @@ impl HandProblem<'_> {
         }
     }
 
-    /// Calls `each` with every landmark's index, its world place, the two rows of derivatives by that place, residuals,
-    /// weight and cost.
+    /// Calls `each` with every landmark's index, its world place, the two rows of derivatives by that place, residuals, weight and
+    /// cost.
     fn sight_terms(&self, at: &HandPose, mut each: impl FnMut(usize, DVec3, [DVec3; 2], DVec2, f64, f64)) {
         let (points, _) = self.points(at);
         let kernel = Kernel::Cauchy(ROBUST);

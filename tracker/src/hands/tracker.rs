@@ -1,4 +1,7 @@
-//! Fingers and head of one person through the frame sets of a rig.
+//! Tracks fingers and head of one person through the frame sets of a rig.
+//!
+//! Per frame set: the networks run on the stalest crops within the budget, then each hand and the head are fitted to the landmarks of
+//! all views. Views whose median residual is too large are dropped, and the fit is repeated without them.
 
 use std::time::Instant;
 
@@ -24,29 +27,29 @@ use crate::image::view::View;
 use crate::landmarks::bias::template_scale;
 use crate::pose::body_model::{BodyModel, PosedSkeleton};
 
-/// Presence from which a network's landmarks are believed.
+/// Least presence of a usable inference.
 const MIN_PRESENCE: f64 = 0.5;
-/// Views whose median landmark is farther off than so many standard deviations see something else.
+/// Median residual above which a view shows something else, standard deviations.
 const OFF_HAND: f64 = 3.0;
-/// Change of an angle between sets at 30 sets a second, radians.
+/// Standard deviation of an angle's change between frame sets at 30 frame sets per second, radians.
 const SMOOTH_RAD: f64 = 0.3;
-/// The body's wrist moves no faster, metres a second.
+/// Limit of the speed of wrists and head, metres per second.
 const MAX_SPEED: f64 = 12.0;
-/// Left hand, right hand, head.
+/// Number of parts: left hand, right hand, head.
 const PARTS: usize = 3;
 const HEAD: usize = 2;
 
-/// Limits of need and budget.
+/// Settings of [`HandTracker`].
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct HandConfig {
-    /// Smallest length of a hand, wrist to fingertip, that the network looks at, pixels.
+    /// Least length of a hand, wrist to fingertip, for the network to run, pixels.
     pub min_hand_px: f64,
-    /// Smallest height of a face that the network looks at, pixels.
+    /// Least height of a face for the network to run, pixels.
     pub min_face_px: f64,
-    /// Crops that the networks look at in a set, hands and faces together; 0 for all that are due.
+    /// Most crops per frame set, hands and faces together; 0 for all that are due.
     pub crops: usize,
-    /// Motion of a hand or head in metres, or of their flesh through a turn, until a view of it gets a new inference. Looks
-    /// grow old by themselves.
+    /// Motion of a hand or head, or of its flesh through rotation, until the network runs on a view of it again, metres. Inferences
+    /// also become stale with age.
     pub look_after_m: f64,
     /// Whether fingers are estimated.
     pub fingers: bool,
@@ -60,7 +63,7 @@ impl Default for HandConfig {
     }
 }
 
-/// Bends the fingers and turns the head of a body whose pose is estimated otherwise.
+/// Tracker of the fingers and the head of a body whose pose is estimated otherwise.
 #[derive(Debug, Clone)]
 pub struct HandTracker {
     hand_net: HandNet,
@@ -71,12 +74,12 @@ pub struct HandTracker {
     body: BodyModel,
     hands: [HandModel; 2],
     scale: f64,
-    /// By part, then slot.
+    /// Last inference of each part and slot.
     inferences: [Vec<Option<PartInference>>; PARTS],
     last: Option<Last>,
 }
 
-/// State after a set.
+/// State after a frame set.
 #[derive(Debug, Clone)]
 struct Last {
     nanos: i64,
@@ -85,17 +88,17 @@ struct Last {
     bends: [Bends; 2],
 }
 
-/// A crop that a network may look at.
+/// Crop that a network may run on.
 struct Candidate {
     part: usize,
     slot: usize,
     crop: Crop,
-    /// See [`PartInference::staleness_m`]; infinite without a inference.
+    /// See [`PartInference::staleness_m`]; infinite without an inference.
     staleness_m: f64,
 }
 
 impl HandTracker {
-    /// For a body in the shape of `template`, which gets fingers if it has none, and the cameras of `rig`.
+    /// Creates a tracker for a body in the shape of `template`, which gets fingers if it has none, and the cameras of `rig`.
     ///
     /// # Errors
     /// Kind `Template` for a body that cannot have fingers, `Rig` for a rig without cameras, `Net` when a network does not
@@ -104,7 +107,7 @@ impl HandTracker {
         Self::with_nets(HandNet::embedded()?, FaceNet::embedded()?, template, rig, config)
     }
 
-    /// As [`Self::new`], with networks that are loaded already.
+    /// Creates a tracker with networks that are loaded already; see [`Self::new`].
     ///
     /// # Errors
     /// Kinds `Template` and `Rig` as those of [`Self::new`].
@@ -134,14 +137,14 @@ impl HandTracker {
         })
     }
 
-    /// The template with fingers that poses are for.
+    /// Returns the template with fingers that poses refer to.
     #[must_use]
     pub fn template(&self) -> &Template {
         &self.template
     }
 
-    /// World places of the hand landmarks in a pose of [`Self::template`], metres: left, right. `None` for a pose that does
-    /// not fit.
+    /// Returns the world places of the hand landmarks in a pose of [`Self::template`], metres: left, right. `None` for a pose that
+    /// does not fit.
     #[must_use]
     pub fn hand_landmarks(&self, pose: &Pose) -> Option<[[DVec3; HAND_LANDMARKS]; 2]> {
         self.template.skeleton.check_pose(pose).ok()?;
@@ -150,15 +153,15 @@ impl HandTracker {
         Some([of(&self.hands[0]), of(&self.hands[1])])
     }
 
-    /// World rotation of the head's flesh from canonical axes in a pose of [`Self::template`]; `None` for a pose that does not
-    /// fit.
+    /// Returns the rotation of the head's flesh from canonical axes to the world in a pose of [`Self::template`]; `None` for a pose
+    /// that does not fit.
     #[must_use]
     pub fn head_rotation(&self, pose: &Pose) -> Option<DQuat> {
         let turns = self.body.to_turns(pose)?;
         Some(self.body.pose(&turns).rotation[self.body.roles.head])
     }
 
-    /// A camera stands elsewhere from the next set on. A slot that does not exist changes nothing.
+    /// Replaces a camera that has moved, from the next frame set on. Slots that do not exist are ignored.
     pub fn move_camera(&mut self, slot: usize, camera: &Camera) {
         if let Some(known) = self.rig.cameras.get_mut(slot) {
             known.clone_from(camera);
@@ -169,7 +172,7 @@ impl HandTracker {
         }
     }
 
-    /// Takes a template of another shape and forgets what was seen.
+    /// Replaces the template and forgets all inferences.
     ///
     /// # Errors
     /// Kind `Template` for a body that cannot have fingers.
@@ -179,18 +182,18 @@ impl HandTracker {
         Ok(())
     }
 
-    /// Forgets what was seen: the person was lost.
+    /// Forgets all inferences, as after the loss of the person.
     pub fn reset(&mut self) {
         self.inferences.iter_mut().flatten().for_each(|inference| *inference = None);
         self.last = None;
     }
 
-    /// Returns the pose with the finger joints of [`Self::template`] and the head turned, from the body's pose at the set's
-    /// time. The body's pose may lack rotations for the finger joints.
+    /// Estimates fingers and head, from the body's pose at the frame set's time, which may lack rotations of the finger joints. Returns
+    /// a pose of [`Self::template`].
     ///
     /// # Errors
-    /// Kind `Template` for a pose that does not fit, `Frames` and `Image` for a set that does not fit the rig, `Net` when a
-    /// network fails. The state stays sound.
+    /// Kind `Template` for a pose that does not fit, `Frames` and `Image` for a frame set that does not fit the rig, `Net` when a
+    /// network fails. The state stays valid.
     pub fn estimate(&mut self, set: &FrameSet, pose: &Pose) -> Result<(Pose, HandsQuality), TrackError> {
         if set.frames.len() != self.rig.cameras.len() {
             return Err(TrackError::new(
@@ -266,7 +269,7 @@ impl HandTracker {
         Ok((self.body.to_pose(&turns), HandsQuality { hands, head, crops, seconds }))
     }
 
-    /// The pose with rotations at rest for joints that it lacks.
+    /// Returns the pose with rotations at rest for joints that it lacks.
     fn extended(&self, pose: &Pose) -> Pose {
         let mut pose = pose.clone();
         let rest = self.template.skeleton.joints().iter().map(|joint| joint.rest_rotation);
@@ -274,12 +277,13 @@ impl HandTracker {
         pose
     }
 
+    /// Returns rotation and place of each part in the world.
     fn frames(&self, posed: &PosedSkeleton) -> [RigidMotion; PARTS] {
         [self.hands[0].hand, self.hands[1].hand, self.body.roles.head]
             .map(|joint| RigidMotion { rotation: posed.rotation[joint], translation: posed.origin[joint] })
     }
 
-    /// Crops of hands and faces that are large enough, and the largest length of each hand, pixels.
+    /// Returns the crops of hands and faces that are large enough, and the largest length of each hand, pixels.
     fn candidates(
         &self,
         set: &FrameSet,
@@ -321,7 +325,7 @@ impl HandTracker {
         (found, largest_px)
     }
 
-    /// Lets the networks look at the crops that need it most, within the budget. Returns the numbers of hands and faces.
+    /// Runs the networks on the stalest crops within the budget. Returns the numbers of hands and faces.
     fn infer(
         &mut self,
         set: &FrameSet,
@@ -368,7 +372,7 @@ impl HandTracker {
         Ok(crops)
     }
 
-    /// Looks of a part that may be used at a time.
+    /// Iterates over the usable inferences of a part at a time.
     fn usable(&self, part: usize, nanos: i64) -> impl Iterator<Item = (&Camera, &PartInference)> {
         let inferences = self.inferences[part].iter().zip(&self.rig.cameras);
         inferences.filter_map(move |(inference, camera)| {
@@ -378,7 +382,7 @@ impl HandTracker {
         })
     }
 
-    /// Fits a hand to the looks at it; `None` leaves it relaxed.
+    /// Fits a hand to its inferences; `None` leaves it relaxed.
     fn fit_hand(
         &self,
         side: usize,
@@ -429,7 +433,7 @@ impl HandTracker {
         Some(pose)
     }
 
-    /// Fits the head to the looks at the face; `None` leaves it as it is.
+    /// Fits the head to the inferences of the face; `None` leaves it in the body's pose.
     fn fit_head(&self, frame: &RigidMotion, nanos: i64, quality: &mut HeadQuality) -> Option<DQuat> {
         let sight = |(camera, inference): (&Camera, &PartInference)| {
             let points = FACE_POINTS.iter().map(|point| point.place_m(self.scale));
@@ -465,12 +469,12 @@ fn sight_of(camera: &Camera, inference: &PartInference, frame: &RigidMotion, nan
     Sight { view: View::new(camera), trust: inference.trust(nanos), carry: inference.carry(frame) }
 }
 
-/// The template with fingers.
+/// Returns the template with fingers.
 fn fingered(template: &Template) -> Result<Template, TrackError> {
     template.with_fingers().map_err(|error| TrackError::new(TrackErrorKind::Template, error.to_string()))
 }
 
-/// Velocities of wrists and head since the last set, metres a second.
+/// Returns the velocities of wrists and head since the last frame set, metres per second.
 fn velocities(last: Option<&Last>, frames: &[RigidMotion; PARTS], nanos: i64) -> [DVec3; PARTS] {
     let Some(last) = last else { return [DVec3::ZERO; PARTS] };
     let secs = 1e-9 * nanos.saturating_sub(last.nanos) as f64;
@@ -483,7 +487,7 @@ fn velocities(last: Option<&Last>, frames: &[RigidMotion; PARTS], nanos: i64) ->
     })
 }
 
-/// Fingers that nobody sees, on their way to the relaxed hand.
+/// Returns unseen fingers on their way to the relaxed hand, `secs` after `before`.
 fn calmed(before: &Bends, secs: f64) -> Bends {
     let share = (secs / FORGET_SECS).clamp(0.0, 1.0);
     let calm = relaxed();
