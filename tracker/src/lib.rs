@@ -1,17 +1,18 @@
 //! Person masks, keypoints, triangulation, the pose and shape fit of a template, and its deformation.
 //!
-//! The input is a [`flyrig_types::FrameSet`] of calibrated cameras, the output the pose of a [`flyrig_body::Template`] and one
-//! mask per camera:
+//! The input is a [`flyrig_types::FrameSet`] of calibrated cameras, the output the pose of a [`flyrig_body::Template`] and
+//! one mask per camera:
 //!
-//! 1. [`PoseNet`] (BlazePose) finds 33 landmarks and a coarse mask in a turned square crop of each image;
-//!    the crop follows the person; a person who was lost is searched in the whole image.
+//! 1. [`PoseNet`] (BlazePose) finds 33 landmarks and a coarse mask in a rotated square crop of each image. The crop
+//!    follows the person; after a loss the whole image is searched.
 //! 2. [`triangulate`] joins the landmarks of the views and leaves out views that disagree.
 //! 3. A damped least-squares fit in pixels turns the template's joints, then refines them with outlines and texture; the
 //!    shape is fitted once, over the first frame sets ([`PoseEstimator::fit_shape`]).
 //! 4. Masks come from the background ([`Background`]) and the network, sharpened on the image and gated by the fitted
 //!    body. [`matte`] solves for coverage and foreground colour along their outlines.
 //!
-//! [`HandTracker`] adds fingers and the head's rotation. [`DeformTracker`] then moves the nodes of a deformation graph so that the posed Gaussians explain the images.
+//! [`HandTracker`] adds fingers and the head's rotation. [`DeformTracker`] then moves the nodes of a deformation graph so
+//! that the posed Gaussians explain the images.
 
 mod deform;
 mod error;

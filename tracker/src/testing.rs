@@ -15,7 +15,7 @@ pub(crate) fn body() -> Template {
     default_template(&ShapeParams::default()).unwrap()
 }
 
-/// A pinhole camera of small square images at the world's origin, about 56 degrees wide.
+/// Returns a pinhole camera of square images at the world's origin, focal length 90 pixels.
 pub(crate) fn small_camera(id: &str, side: usize) -> Camera {
     Camera {
         time_offset_nanos: 0,
@@ -32,7 +32,7 @@ pub(crate) fn small_camera(id: &str, side: usize) -> Camera {
     }
 }
 
-/// Cameras on a ring of 3.5 m around the origin, z up, with some distortion.
+/// Returns cameras on a ring of 3.5 m around the origin, z up, with some distortion.
 pub(crate) fn ring(count: usize) -> Rig {
     let cameras = (0..count)
         .map(|i| {
@@ -63,19 +63,19 @@ pub(crate) fn keypoints_of(camera: &Camera, points: &[DVec3; LANDMARK_COUNT]) ->
     })
 }
 
-/// A fit to landmarks alone, without a pose before.
+/// Returns a fit to landmarks alone, without a last pose.
 pub(crate) fn fit_problem<'a>(model: &'a BodyModel, views: &'a [FitView], landmark_spread: f64) -> FitProblem<'a> {
     FitProblem { model, views, lines: &[], points: [None; LANDMARK_COUNT], before: None, landmark_spread, robust: 2.0 }
 }
 
-/// The mask of a posed body.
+/// Returns the mask of a posed body.
 pub(crate) fn mask_of(camera: &Camera, template: &Template, pose: &Pose) -> Mask {
     let (vertices, _) = skin_mesh(template, pose);
     let ([x0, y0, ..], body) = drawn_body(camera, &vertices, &template.triangles, 4.0).unwrap();
     body.paste(camera.intrinsics.width as usize, camera.intrinsics.height as usize, x0, y0).unwrap()
 }
 
-/// The same with Gaussian-like noise in pixels.
+/// Returns [`keypoints_of`] with uniform noise of about `noise_px` standard deviation.
 pub(crate) fn noisy_keypoints(
     camera: &Camera,
     points: &[DVec3; LANDMARK_COUNT],
@@ -89,7 +89,7 @@ pub(crate) fn noisy_keypoints(
     })
 }
 
-/// A body that stands near the origin of a z-up world in a comfortable pose.
+/// Returns a body that stands near the origin of a z-up world in a comfortable pose.
 pub(crate) fn random_turns(model: &BodyModel, seed: u64) -> JointTurns {
     let mut rng = StdRng::seed_from_u64(seed);
     let mut turns = model.bind_turns(DVec3::new(rng.random_range(-0.2..0.2), rng.random_range(-0.2..0.2), 1.0));

@@ -15,8 +15,8 @@ pub(super) struct Carried {
     pub matrix: DMat3,
 }
 
-/// Returns `B^T g` and `B^T H B` of each Gaussian, with B its blended bone matrix (d LBS(x + t_x) / d t_x), zero for unseen ones; and
-/// the number of Gaussians that were dropped because a number was not finite.
+/// Returns `B^T g` and `B^T H B` of each Gaussian, with B its blended bone matrix (d LBS(x + t_x) / d t_x), zero for unseen
+/// ones; and the number of Gaussians that were dropped because a number was not finite.
 pub(super) fn to_canonical(derivatives: &PointDerivatives, skin: &[SkinWeights]) -> (Vec<Carried>, usize) {
     let one = |g: usize| -> Result<Carried, ()> {
         let gradient = derivatives.gradient.get(g).copied().unwrap_or_default();

@@ -14,7 +14,8 @@ pub struct PointDerivatives {
     pub curvature: Vec<[f32; 4]>,
 }
 
-/// Comparison of the posed, displaced Gaussians with the images of a frame set: `λ_color L_color + λ_mask L_mask` of FlyHuman Eq. 3.
+/// Comparison of the posed, displaced Gaussians with the images of a frame set: `λ_color L_color + λ_mask L_mask` of
+/// FlyHuman Eq. 3.
 pub trait DataTerm {
     /// Error of the comparison.
     type Error;
@@ -25,8 +26,8 @@ pub trait DataTerm {
     /// The implementation's.
     fn loss(&mut self, displacement: &[[f32; 4]]) -> Result<f64, Self::Error>;
 
-    /// Returns the loss and writes its derivatives into `out`: one element per instant of the images (a single one when the cameras
-    /// are synchronous), to be summed.
+    /// Returns the loss and writes its derivatives into `out`: one element per instant of the images (a single one when the
+    /// cameras are synchronous), to be summed.
     ///
     /// # Errors
     /// The implementation's.

@@ -7,8 +7,8 @@ use crate::deform::carry::Carried;
 
 /// Marks a missing pair.
 const NONE: u32 = u32::MAX;
-/// Share of the first residual at which conjugate gradients end, and their largest number of iterations. The step is tested on the
-/// images anyway: 1e-4 lowers the loss no further and takes twice as long.
+/// Share of the first residual at which conjugate gradients end, and their largest number of iterations. The step is tested
+/// on the images anyway: 1e-4 lowers the loss no further and takes twice as long.
 const TOLERANCE: f64 = 1e-3;
 const MAX_ITERATIONS: usize = 200;
 /// Rows per parallel task of a product.
@@ -129,8 +129,8 @@ impl NormalMatrix {
         self.off_diagonal.fill(DMat3::ZERO);
     }
 
-    /// Adds the derivatives by the Gaussians' displacements to `gradient` by the nodes, and with `with_matrix` to H. Each sum runs in the
-    /// order of the Gaussians: equal input gives equal bytes for any number of threads.
+    /// Adds the derivatives by the Gaussians' displacements to `gradient` by the nodes, and with `with_matrix` to H. Each
+    /// sum runs in the order of the Gaussians: equal input gives equal bytes for any number of threads.
     pub(super) fn accumulate(&mut self, own: &[Carried], gradient: &mut [DVec3], with_matrix: bool) {
         let Self { of_node, of_pair, diagonal, off_diagonal, .. } = self;
         let nodes = gradient.par_iter_mut().zip(diagonal).enumerate().with_min_len(SUMS_A_TASK);

@@ -29,8 +29,8 @@ impl Regularizer {
         if self.history { self.temporal } else { 0.0 }
     }
 
-    /// Returns the loss at translations `t` with smoothed translations `smooth`, and adds its gradient to `gradient`. Spatial smoothness
-    /// and the anchor are measured from `thickness`.
+    /// Returns the loss at translations `t` with smoothed translations `smooth`, and adds its gradient to `gradient`.
+    /// Spatial smoothness and the anchor are measured from `thickness`.
     pub(super) fn loss(
         &self,
         t: &[DVec3],

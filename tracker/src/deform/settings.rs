@@ -17,8 +17,8 @@ pub enum DeformSolver {
     },
 }
 
-/// Weights and limits of the solver. In another unit of length, with every number that has metres in its unit converted, the solution
-/// is the same.
+/// Weights and limits of the solver. In another unit of length, with every number that has metres in its unit converted,
+/// the solution is the same.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct DeformSettings {
     /// Method of a step.
@@ -29,8 +29,8 @@ pub struct DeformSettings {
     pub spatial: f64,
     /// λ_temp of Eq. 4. The paper's 2.
     pub temporal: f64,
-    /// Weight of a node's squared distance from the place of its pose, units of loss per square metre. With 0, a common shift of all
-    /// nodes costs nothing, and a free pose has nothing to gain.
+    /// Weight of a node's squared distance from the place of its pose, units of loss per square metre. With 0, a common
+    /// shift of all nodes costs nothing, and a free pose has nothing to gain.
     pub anchor: f64,
     /// Share of this frame set's translation in the smoothed one of Eq. 4, 0..=1. The paper gives no value.
     pub smoothing: f64,
@@ -40,12 +40,13 @@ pub struct DeformSettings {
     pub max_step_m: f64,
     /// Largest distance of a node from the place of its pose, metres.
     pub max_translation_m: f64,
-    /// Plausible range of the thickness of clothes where no camera looks, metres; negative for a body thinner than its template.
+    /// Plausible range of the thickness of clothes where no camera looks, metres; negative for a body thinner than its
+    /// template.
     pub thickness_m: [f64; 2],
     /// Attempts with growing damping before an iteration gives up.
     pub attempts: usize,
-    /// Share of the loss at which iterations stop: after a frame set that lowered its loss by less, frame sets whose loss is at most this
-    /// share above get no iteration; with 0 every frame set gets its iterations.
+    /// Share of the loss at which iterations stop: after a frame set that lowered its loss by less, frame sets whose loss
+    /// is at most this share above get no iteration; with 0 every frame set gets its iterations.
     pub rest: f64,
 }
 

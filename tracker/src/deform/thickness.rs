@@ -9,8 +9,8 @@ const LEAST_SHARE: f64 = 0.01;
 /// Share of a frame set in the known thickness, after the first.
 const RATE: f64 = 0.5;
 
-/// Mean displacement of each part along its normals, where the images constrain it. Smoothness (Eq. 4) is measured from there, so that
-/// the unseen side of a sleeve is not dragged along by the seen one but follows it outwards.
+/// Mean displacement of each part along its normals, where the images constrain it. Smoothness (Eq. 4) is measured from
+/// there, so that the unseen side of a sleeve is not dragged along by the seen one but follows it outwards.
 #[derive(Debug)]
 pub(super) struct Thickness {
     /// Canonical normals of the nodes, and their parts.

@@ -17,18 +17,18 @@ const DAMPING_RANGE: (f64, f64) = (1e-3, 1e6);
 /// Ratios of actual to predicted decrease of the loss above and below which the damping changes after a step.
 const GOOD_GAIN: f64 = 0.75;
 const POOR_GAIN: f64 = 0.25;
-/// Least predicted decrease of the loss, as a share of it, for a step to be tried: the images' sums are `f32`, and rounding would
-/// otherwise decide on the damping of the next frame sets.
+/// Least predicted decrease of the loss, as a share of it, for a step to be tried: the images' sums are `f32`, and rounding
+/// would otherwise decide on the damping of the next frame sets.
 const LEAST_GAIN: f64 = 1e-5;
-/// Damping that keeps the matrix regular where neither image nor neighbour constrains a node, as a share of its mean diagonal, so that
-/// the unit of length does not matter.
+/// Damping that keeps the matrix regular where neither image nor neighbour constrains a node, as a share of its mean
+/// diagonal, so that the unit of length does not matter.
 const LEAST_DAMPING: f64 = 1e-11;
 
 /// Report of the solver on one frame set.
 #[derive(Debug, Clone, PartialEq, Default)]
 pub struct DeformReport {
-    /// Total loss (Eq. 3) before the first iteration and after each one; for [`DeformSolver::Paper`], which does not evaluate its
-    /// steps, before each one.
+    /// Total loss (Eq. 3) before the first iteration and after each one; for [`DeformSolver::Paper`], which does not
+    /// evaluate its steps, before each one.
     pub losses: Vec<f64>,
     /// Accepted steps.
     pub accepted: usize,
@@ -42,8 +42,8 @@ pub struct DeformReport {
     pub at_rest: bool,
 }
 
-/// Translations of the graph's nodes, tracked over time. The state stays finite: a frame set whose loss is not finite changes
-/// nothing.
+/// Translations of the graph's nodes, tracked over time. The state stays finite: a frame set whose loss is not finite
+/// changes nothing.
 #[derive(Debug)]
 pub struct DeformTracker {
     settings: DeformSettings,
@@ -119,8 +119,8 @@ impl DeformTracker {
         })
     }
 
-    /// Scales the stiffness of parts of the body (head, hands and feet are stiffer than clothes): an edge's share of Eq. 4 is multiplied
-    /// by the geometric mean of its two nodes' numbers. Gradient descent ignores it.
+    /// Scales the stiffness of parts of the body (head, hands and feet are stiffer than clothes): an edge's share of Eq. 4
+    /// is multiplied by the geometric mean of its two nodes' numbers. Gradient descent ignores it.
     ///
     /// # Errors
     /// [`TrackErrorKind::Template`] unless there is one finite number above 0 per node.
@@ -140,8 +140,8 @@ impl DeformTracker {
         Ok(self)
     }
 
-    /// Estimates the thickness of clothes on each part where images constrain it, and applies it where they do not. Takes one canonical
-    /// unit normal and one part number per node. Gradient descent ignores it.
+    /// Estimates the thickness of clothes on each part where images constrain it, and applies it where they do not. Takes
+    /// one canonical unit normal and one part number per node. Gradient descent ignores it.
     ///
     /// # Errors
     /// [`TrackErrorKind::Template`] unless there are one finite normal and one part per node.
@@ -178,7 +178,8 @@ impl DeformTracker {
         self.frame = 0;
     }
 
-    /// Resumes from translations of an earlier tracker of the same graph, canonical metres; the next frame set counts as the first.
+    /// Resumes from translations of an earlier tracker of the same graph, canonical metres; the next frame set counts as
+    /// the first.
     ///
     /// # Errors
     /// [`TrackErrorKind::Template`] unless there is one finite translation per node.
@@ -200,7 +201,8 @@ impl DeformTracker {
         &self.translations
     }
 
-    /// Returns the canonical displacements t_x of the Gaussians (Eq. 2), metres, with their growth in w ([`flyrig_body::displacement`]).
+    /// Returns the canonical displacements t_x of the Gaussians (Eq. 2), metres, with their growth in w
+    /// ([`flyrig_body::displacement`]).
     #[must_use]
     pub fn displacement(&self) -> &[[f32; 4]] {
         &self.displacement

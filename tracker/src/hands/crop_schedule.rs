@@ -17,7 +17,8 @@ const HALF_SECS: f64 = 0.12;
 const AGING_M_PER_SEC: f64 = 0.05;
 /// Landmarks between the wrist and the middle joints, which frame a crop as in the original's hand tracking.
 const PALM: [usize; 12] = [0, 1, 2, 3, 5, 6, 9, 10, 13, 14, 17, 18];
-/// Side of a crop as a multiple of the palm's frame, and its shift towards the fingers: those that the network was trained with.
+/// Side of a crop as a multiple of the palm's frame, and its shift towards the fingers: those that the network was trained
+/// with.
 const HAND_MARGIN: f64 = 2.0;
 const HAND_SHIFT: f64 = 0.1;
 /// Least side of a crop, lengths of the unforeshortened hand.
@@ -28,7 +29,7 @@ const FACE_MARGIN: f64 = 1.5;
 /// Smallest cosine between a face and the way to the camera.
 const FACING: f64 = 0.2;
 
-/// A network's landmarks of a hand or a face in one view.
+/// Last inference of a network on a hand or a face in one view.
 #[derive(Debug, Clone)]
 pub(crate) struct PartInference {
     pub nanos: i64,
@@ -40,7 +41,8 @@ pub(crate) struct PartInference {
 }
 
 impl PartInference {
-    /// Returns the motion of the part since, metres: of its joint, of flesh at `reach_m` through rotation, and a share of age.
+    /// Returns the motion of the part since, metres: of its joint, of flesh at `reach_m` through rotation, and a share of
+    /// age.
     pub fn staleness_m(&self, frame: &RigidMotion, reach_m: f64, nanos: i64) -> f64 {
         let turned = self.frame.rotation.angle_between(frame.rotation) * reach_m;
         self.frame.translation.distance(frame.translation) + turned + AGING_M_PER_SEC * self.age_secs(nanos)
@@ -73,8 +75,8 @@ fn turn_of(up: DVec2) -> DVec2 {
     up.perp().normalize_or(DVec2::X)
 }
 
-/// Returns the crop around a hand whose landmarks are expected at world points (metres); `length_px` is the hand's length in the image.
-/// `None` when the hand is out of the image.
+/// Returns the crop around a hand whose landmarks are expected at world points (metres); `length_px` is the hand's length
+/// in the image. `None` when the hand is out of the image.
 pub(crate) fn hand_crop(camera: &Camera, points: &[DVec3; HAND_LANDMARKS], length_px: f64) -> Option<Crop> {
     let mut pixels = [DVec2::ZERO; HAND_LANDMARKS];
     for (pixel, point) in pixels.iter_mut().zip(points) {

@@ -22,8 +22,8 @@ pub(crate) const RIGID: [usize; 56] = [
     284, 116, 345, 164,
 ];
 
-/// Places as printed by `flyrig-bench hands --learn-face --seed 301 --people 6 --frames 6 --cameras 7 --px 80`: 108 faces of six simulated
-/// people; lines of sight pass the places at a median distance of 4 to 8 mm.
+/// Places as printed by `flyrig-bench hands --learn-face --seed 301 --people 6 --frames 6 --cameras 7 --px 80`: 108 faces
+/// of six simulated people; lines of sight pass the places at a median distance of 4 to 8 mm.
 pub(crate) const FACE_POINTS: &[FacePoint] = &[
     FacePoint { landmark: 1, place_mm: [-0.5, 2.3, 130.1] },
     FacePoint { landmark: 2, place_mm: [-0.3, -4.5, 119.1] },

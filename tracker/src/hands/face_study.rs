@@ -1,7 +1,8 @@
-//! Measures the places of the face network's landmarks on a head, for the table of [`face_points`](crate::hands::face_points).
+//! Measures the places of the face network's landmarks on a head, for the table of
+//! [`face_points`](crate::hands::face_points).
 //!
-//! A landmark's place is the point nearest to its lines of sight in many images of people whose pose is known (iteratively reweighted
-//! least squares).
+//! A landmark's place is the point nearest to its lines of sight in many images of people whose pose is known (iteratively
+//! reweighted least squares).
 
 use flyrig_body::Template;
 use flyrig_types::{Camera, Image, Pose};
@@ -77,7 +78,8 @@ impl FaceStudy {
         Ok(true)
     }
 
-    /// Returns index, place in metres and the median distance of its lines in metres of each landmark that was seen often enough.
+    /// Returns index, place in metres and the median distance of its lines in metres of each landmark that was seen often
+    /// enough.
     #[must_use]
     pub fn places(&self) -> Vec<(usize, DVec3, f64)> {
         let of = |(landmark, rays): (&usize, &Vec<Ray>)| {

@@ -1,10 +1,10 @@
 //! Damped least squares of one hand on the landmarks of all views.
 //!
-//! The unknowns are shift and rotation of the wrist relative to the body's pose and 20 angles of the fingers. The cost is half the
-//! sum of squared residuals over standard deviations: landmark distances in the images (Cauchy weights), the wrist's change,
-//! deviations of angles from the relaxed hand and from the last frame set, limits of angles, and the coupling of a finger's last
-//! two joints (the last bends about two thirds as far as the one before: Lin, Wu and Huang, "Modeling the constraints of human
-//! hand motion", 2000, eq. 4).
+//! The unknowns are shift and rotation of the wrist relative to the body's pose and 20 angles of the fingers. The cost is
+//! half the sum of squared residuals over standard deviations: landmark distances in the images (Cauchy weights), the
+//! wrist's change, deviations of angles from the relaxed hand and from the last frame set, limits of angles, and the
+//! coupling of a finger's last two joints (the last bends about two thirds as far as the one before: Lin, Wu and Huang,
+//! "Modeling the constraints of human hand motion", 2000, eq. 4).
 
 use flyrig_solve::{
     Convergence, DenseNormal, Kernel, Problem, RigidMotion, exp_rotation, left_jacobian_inverse, log_rotation, minimize,
@@ -126,8 +126,8 @@ impl HandProblem<'_> {
         }
     }
 
-    /// Calls `each` with every landmark's index, its world place, the two rows of derivatives by that place, residuals, weight and
-    /// cost.
+    /// Calls `each` with every landmark's index, its world place, the two rows of derivatives by that place, residuals,
+    /// weight and cost.
     fn sight_terms(&self, at: &HandPose, mut each: impl FnMut(usize, DVec3, [DVec3; 2], DVec2, f64, f64)) {
         let (points, _) = self.points(at);
         let kernel = Kernel::Cauchy(ROBUST);

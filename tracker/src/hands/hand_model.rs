@@ -138,7 +138,8 @@ impl HandModel {
     }
 }
 
-/// Returns the middle of the fingertip: the mean of the flesh on the last joint within 6 mm of its end; `None` without vertices.
+/// Returns the middle of the fingertip: the mean of the flesh on the last joint within 6 mm of its end; `None` without
+/// vertices.
 fn tip(template: &Template, joint: usize, origin: DVec3, along: DVec3) -> Option<DVec3> {
     const END_M: f64 = 0.006;
     let own = |(_, skin): &(&glam::Vec3, &flyrig_body::SkinWeights)| usize::from(skin.joints[0]) == joint;

@@ -1,7 +1,8 @@
 //! Damped least squares of the head's rotation on the face landmarks of all views.
 //!
-//! The unknowns are shift and rotation relative to the body's pose and the size of the face. The landmarks lie at measured places of
-//! an average face ([`FACE_POINTS`](crate::hands::face_points::FACE_POINTS)); size and shift absorb the differences between people.
+//! The unknowns are shift and rotation relative to the body's pose and the size of the face. The landmarks lie at measured
+//! places of an average face ([`FACE_POINTS`](crate::hands::face_points::FACE_POINTS)); size and shift absorb the
+//! differences between people.
 
 use flyrig_solve::{
     Convergence, DenseNormal, Kernel, Problem, RigidMotion, exp_rotation, left_jacobian_inverse, log_rotation, minimize,
@@ -21,8 +22,8 @@ const ROBUST: f64 = 2.0;
 const SHIFT_M: f64 = 0.02;
 const TURN_RAD: f64 = 0.5;
 const LN_SIZE: f64 = 0.08;
-/// Number of independent measurements that the landmarks of a view are worth: more of them share their weight, since their errors
-/// are correlated.
+/// Number of independent measurements that the landmarks of a view are worth: more of them share their weight, since their
+/// errors are correlated.
 const COUNT: f64 = 12.0;
 /// Largest number of solver steps.
 const MAX_STEPS: usize = 20;
@@ -31,7 +32,8 @@ const MAX_STEPS: usize = 20;
 #[derive(Debug, Clone)]
 pub(crate) struct FaceSight {
     pub sight: Sight,
-    /// Undistorted pixels from the principal point, and the place on the head: canonical axes from the head's joint, metres.
+    /// Undistorted pixels from the principal point, and the place on the head: canonical axes from the head's joint,
+    /// metres.
     pub seen: Vec<(DVec2, DVec3)>,
 }
 

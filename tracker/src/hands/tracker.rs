@@ -1,7 +1,7 @@
 //! Tracks fingers and head of one person through the frame sets of a rig.
 //!
-//! Per frame set: the networks run on the stalest crops within the budget, then each hand and the head are fitted to the landmarks of
-//! all views. Views whose median residual is too large are dropped, and the fit is repeated without them.
+//! Per frame set: the networks run on the stalest crops within the budget, then each hand and the head are fitted to the
+//! landmarks of all views. Views whose median residual is too large are dropped, and the fit is repeated without them.
 
 use std::time::Instant;
 
@@ -48,8 +48,8 @@ pub struct HandConfig {
     pub min_face_px: f64,
     /// Most crops per frame set, hands and faces together; 0 for all that are due.
     pub crops: usize,
-    /// Motion of a hand or head, or of its flesh through rotation, until the network runs on a view of it again, metres. Inferences
-    /// also become stale with age.
+    /// Motion of a hand or head, or of its flesh through rotation, until the network runs on a view of it again, metres.
+    /// Inferences also become stale with age.
     pub look_after_m: f64,
     /// Whether fingers are estimated.
     pub fingers: bool,
@@ -98,7 +98,8 @@ struct Candidate {
 }
 
 impl HandTracker {
-    /// Creates a tracker for a body in the shape of `template`, which gets fingers if it has none, and the cameras of `rig`.
+    /// Creates a tracker for a body in the shape of `template`, which gets fingers if it has none, and the cameras of
+    /// `rig`.
     ///
     /// # Errors
     /// Kind `Template` for a body that cannot have fingers, `Rig` for a rig without cameras, `Net` when a network does not
@@ -143,8 +144,8 @@ impl HandTracker {
         &self.template
     }
 
-    /// Returns the world places of the hand landmarks in a pose of [`Self::template`], metres: left, right. `None` for a pose that
-    /// does not fit.
+    /// Returns the world places of the hand landmarks in a pose of [`Self::template`], metres: left, right. `None` for a
+    /// pose that does not fit.
     #[must_use]
     pub fn hand_landmarks(&self, pose: &Pose) -> Option<[[DVec3; HAND_LANDMARKS]; 2]> {
         self.template.skeleton.check_pose(pose).ok()?;
@@ -153,8 +154,8 @@ impl HandTracker {
         Some([of(&self.hands[0]), of(&self.hands[1])])
     }
 
-    /// Returns the rotation of the head's flesh from canonical axes to the world in a pose of [`Self::template`]; `None` for a pose
-    /// that does not fit.
+    /// Returns the rotation of the head's flesh from canonical axes to the world in a pose of [`Self::template`]; `None`
+    /// for a pose that does not fit.
     #[must_use]
     pub fn head_rotation(&self, pose: &Pose) -> Option<DQuat> {
         let turns = self.body.to_turns(pose)?;
@@ -188,12 +189,12 @@ impl HandTracker {
         self.last = None;
     }
 
-    /// Estimates fingers and head, from the body's pose at the frame set's time, which may lack rotations of the finger joints. Returns
-    /// a pose of [`Self::template`].
+    /// Estimates fingers and head, from the body's pose at the frame set's time, which may lack rotations of the finger
+    /// joints. Returns a pose of [`Self::template`].
     ///
     /// # Errors
-    /// Kind `Template` for a pose that does not fit, `Frames` and `Image` for a frame set that does not fit the rig, `Net` when a
-    /// network fails. The state stays valid.
+    /// Kind `Template` for a pose that does not fit, `Frames` and `Image` for a frame set that does not fit the rig, `Net`
+    /// when a network fails. The state stays valid.
     pub fn estimate(&mut self, set: &FrameSet, pose: &Pose) -> Result<(Pose, HandsQuality), TrackError> {
         if set.frames.len() != self.rig.cameras.len() {
             return Err(TrackError::new(
@@ -550,7 +551,7 @@ mod tests {
             assert_eq!(quality.crops, [2, 0]);
         }
         assert!(tracker.inferences[..2].iter().flatten().all(Option::is_some));
-        // Nothing has moved, and no look is old.
+        // No part has moved, and no inference is old.
         let (_, quality) = tracker.estimate(&grey_set(&rig, 4_000_000), &pose).unwrap();
         assert_eq!(quality.crops, [0, 0]);
     }

@@ -8,7 +8,8 @@ use crate::landmarks::keypoints::{
 };
 use crate::network::output::{NET_SIDE, NetOutput};
 
-/// Half side of a crop over the distance of the farthest landmark: the network was trained with a quarter more than the person.
+/// Half side of a crop over the distance of the farthest landmark: the network was trained with a quarter more than the
+/// person.
 const MARGIN: f64 = 1.25;
 
 /// Square of an image, rotated so that the person stands upright in it.
@@ -18,7 +19,7 @@ pub(crate) struct Crop {
     pub center: DVec2,
     /// Side, pixels of the image.
     pub side: f64,
-    /// The crop's x axis in the image, a unit vector.
+    /// Direction of the crop's x axis in the image, a unit vector.
     pub turn: DVec2,
 }
 
@@ -71,8 +72,8 @@ impl Crop {
         self.sample_square(picture, NET_SIDE)
     }
 
-    /// Samples a crop of `net_side` x `net_side` pixels: RGB in 0..=1, row by row, black outside the image. Each value averages
-    /// enough samples that a large crop does not alias.
+    /// Samples a crop of `net_side` x `net_side` pixels: RGB in 0..=1, row by row, black outside the image. Each value
+    /// averages enough samples that a large crop does not alias.
     pub fn sample_square(&self, picture: &Rgb, net_side: usize) -> Vec<f32> {
         let taps = ((self.side / net_side as f64).round() as usize).clamp(1, 4);
         let mut rgb = Vec::with_capacity(net_side * net_side * 3);

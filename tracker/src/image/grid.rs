@@ -109,8 +109,8 @@ impl Grid {
         out
     }
 
-    /// Smooths along the edges of `guide` by the guided filter (He et al. 2010) with a window of `2 radius + 1` pixels and the
-    /// regularisation `epsilon`.
+    /// Smooths along the edges of `guide` by the guided filter (He et al. 2010) with a window of `2 radius + 1` pixels and
+    /// the regularisation `epsilon`.
     pub fn guided(&self, guide: &Self, radius: usize, epsilon: f32) -> Self {
         let product =
             |a: &Self, b: &Self| Self { values: a.values.iter().zip(&b.values).map(|(a, b)| a * b).collect(), ..*a };

@@ -148,7 +148,7 @@ mod tests {
             let is_inside = (140..180).contains(&x) && (60..200).contains(&y);
             if is_inside { 40.0 } else { 100.0 }
         };
-        assert!(!is_blank(&image(&person, 5.0)).unwrap(), "somebody before a plain wall");
+        assert!(!is_blank(&image(&person, 5.0)).unwrap(), "a person before a plain wall");
         let small = Image::new(20, 20, PixelFormat::Rgb8, vec![0; 1200]).unwrap();
         assert!(!is_blank(&small).unwrap(), "too small to say");
     }

@@ -1,5 +1,5 @@
-//! Systematic bias and spread of the pose network's landmarks, relative to the joints and places on the skin that they are named
-//! after.
+//! Systematic bias and spread of the pose network's landmarks, relative to the joints and places on the skin that they are
+//! named after.
 //!
 //! Both are measured on simulated people whose pose is known ([`LandmarkStudy`](crate::LandmarkStudy)). The fit places
 //! landmarks with their bias and divides residuals by their spread, which grows as the confidence falls.
@@ -19,8 +19,9 @@ struct Measured {
     spread_mm: f64,
 }
 
-/// Biases and spreads as printed by `flyrig-bench landmarks` for eight simulated people (seeds 301 to 308, a motion each, 7 cameras, 30 frames).
-/// The signs are anatomy: the network's hips lie at the outer hip bone, its shoulders on top of the joint.
+/// Biases and spreads as printed by `flyrig-bench landmarks` for eight simulated people (seeds 301 to 308, a motion each, 7
+/// cameras, 30 frames). The signs are anatomy: the network's hips lie at the outer hip bone, its shoulders on top of the
+/// joint.
 const MEASURED: [Measured; 17] = [
     Measured { landmark: 0, bias_mm: [-4.0, 4.0, -10.0], spread_mm: 14.0 },
     Measured { landmark: 1, bias_mm: [0.0, 0.0, -11.0], spread_mm: 13.0 },
@@ -41,8 +42,8 @@ const MEASURED: [Measured; 17] = [
     Measured { landmark: 31, bias_mm: [-1.0, -7.0, -5.0], spread_mm: 28.0 },
 ];
 
-/// Confidence of a landmark, and its spread as a multiple of a sure one's (90 % lie within it), as printed by the same command for
-/// twelve further people (seeds 401 to 412): the network guesses hidden joints fairly well.
+/// Confidence of a landmark, and its spread as a multiple of a sure one's (90 % lie within it), as printed by the same
+/// command for twelve further people (seeds 401 to 412): the network guesses hidden joints fairly well.
 const DOUBTS: [(f64, f64); 8] =
     [(0.025, 7.4), (0.075, 4.6), (0.15, 4.4), (0.25, 3.6), (0.4, 2.5), (0.6, 1.6), (0.8, 1.2), (0.95, 1.0)];
 

@@ -1,8 +1,8 @@
 //! Schedule of the pose network: its last inference in each view, and when the next one is due.
 //!
-//! The network is the most expensive part of an estimate. An inference stays valid while the body hardly moves: its landmarks
-//! and its mask are carried along with the body ([`carried_mask`](crate::masks::carried_mask)). A view is due once the body has
-//! moved in it by more than [`PoseConfig::look_after_m`](crate::PoseConfig::look_after_m), or with age.
+//! The network is the most expensive part of an estimate. An inference stays valid while the body hardly moves: its
+//! landmarks and its mask are carried along with the body ([`carried_mask`](crate::masks::carried_mask)). A view is due
+//! once the body has moved in it by more than [`PoseConfig::look_after_m`](crate::PoseConfig::look_after_m), or with age.
 
 use std::sync::Arc;
 
@@ -48,8 +48,9 @@ impl Inference {
         moved + AGING_M_PER_SEC * 1e-9 * nanos.saturating_sub(body.nanos).max(0) as f64
     }
 
-    /// Returns each landmark's displacement from the last frame set to the inference, metres, and the factor of its confidence. An old
-    /// inference does not observe motion since the last frame set: a predicted motion that counted as seen would feed itself.
+    /// Returns each landmark's displacement from the last frame set to the inference, metres, and the factor of its
+    /// confidence. An old inference does not observe motion since the last frame set: a predicted motion that counted as
+    /// seen would feed itself.
     pub fn carried(
         &self,
         last: &[DVec3; LANDMARK_COUNT],
@@ -63,9 +64,9 @@ impl Inference {
     }
 }
 
-/// Chooses the views in which the network runs again: all without an inference, all in which the body has moved far, and the
-/// stalest of those in which it has moved by more than `limit_m` metres. Views without an image are never due. At most `most`
-/// views that have an inference are chosen, the stalest first.
+/// Chooses the views in which the network runs again: all without an inference, all in which the body has moved far, and
+/// the stalest of those in which it has moved by more than `limit_m` metres. Views without an image are never due. At most
+/// `most` views that have an inference are chosen, the stalest first.
 pub(crate) fn due(
     inferences: &[Option<Inference>],
     has_image: impl Fn(usize) -> bool,

@@ -1,8 +1,8 @@
 //! Search for a person who may be anywhere, spread over frame sets so that none takes long.
 //!
-//! Each step runs the network around foreground that differs from the background, where other views have found a person, and on
-//! the next few of the crops that cover the whole image. Hypotheses of the views are joined by triangulation: the person whom
-//! most views agree on wins, with preference for the place that the cameras look at.
+//! Each step runs the network around foreground that differs from the background, where other views have found a person,
+//! and on the next few of the crops that cover the whole image. Hypotheses of the views are joined by triangulation: the
+//! person whom most views agree on wins, with preference for the centre of the cameras' attention.
 
 use std::sync::Arc;
 
@@ -69,9 +69,9 @@ struct ViewSearch {
 }
 
 impl Search {
-    /// Continues the search and returns the sightings of the person whom most views agree on, in rig order. Without agreement,
-    /// once every image was searched as a whole, this is the surest and largest sighting of one view. Without any sighting the search
-    /// goes on in the next frame set.
+    /// Continues the search and returns the sightings of the person whom most views agree on, in rig order. Without
+    /// agreement, once every image was searched as a whole, this is the surest and largest sighting of one view. Without
+    /// any sighting the search goes on in the next frame set.
     pub fn step(&mut self, scene: &SearchScene<'_>) -> Result<Vec<Option<Sighting>>, TrackError> {
         self.views.resize_with(scene.cameras.len(), ViewSearch::default);
         self.views
@@ -390,7 +390,7 @@ mod tests {
         assert_eq!(
             choose(&poisoned, &seen_by(&rig.cameras, &[DVec3::ZERO])).len(),
             3,
-            "poison chooses anybody or nobody"
+            "poison chooses any person or none"
         );
         assert!(choose(&poisoned, &[]).is_empty());
     }

@@ -9,9 +9,9 @@ use crate::image::view::{View, observe};
 use crate::landmarks::keypoints::LANDMARK_COUNT;
 use crate::landmarks::sighting::Sighting;
 
-/// Returns world points in metres from one view: the network's hip-centred landmarks (metres, for a trunk of half a metre, times
-/// `scale`), rotated as the crop, at the place where they explain the image best (linear least squares). `None` when that place is
-/// behind the camera or not finite.
+/// Returns world points in metres from one view: the network's hip-centred landmarks (metres, for a trunk of half a metre,
+/// times `scale`), rotated as the crop, at the place where they explain the image best (linear least squares). `None` when
+/// that place is behind the camera or not finite.
 pub(crate) fn lift(
     camera: &Camera,
     sighting: &Sighting,
@@ -58,9 +58,9 @@ pub(crate) fn lift(
 /// Share of the frame sets in which the feet may be in the air, where the person seems to stand farther away.
 const IN_THE_AIR: f64 = 0.6;
 
-/// Returns the ratio of a person's size to that of bodies that fill the same pixels (world vertices in metres, one body per frame
-/// set): bodies grow along the lines of sight until their lowest points meet the floor at height `floor_m` along `up`. `None` unless
-/// the camera looks down on the feet.
+/// Returns the ratio of a person's size to that of bodies that fill the same pixels (world vertices in metres, one body per
+/// frame set): bodies grow along the lines of sight until their lowest points meet the floor at height `floor_m` along
+/// `up`. `None` unless the camera looks down on the feet.
 pub(crate) fn growth_to_floor(camera: &Camera, up: DVec3, floor_m: f64, bodies: &[Vec<Vec3>]) -> Option<f64> {
     let up = up.try_normalize()?;
     let above = |at: DVec3| at.dot(up) - floor_m;
@@ -82,7 +82,8 @@ mod tests {
     use flyrig_body::skin_mesh;
     use glam::DQuat;
 
-    /// The built-in body on the floor at a place, `height` above it, as a body of `size` times its size that fills the same pixels.
+    /// The built-in body on the floor at a place, `height` above it, as a body of `size` times its size that fills the same
+    /// pixels.
     fn seen_as(camera: &Camera, place: [f64; 2], height: f64, size: f64) -> Vec<Vec3> {
         let body = body();
         let mut pose = body.skeleton.rest_pose();

@@ -16,8 +16,8 @@ use crate::landmarks::sighting::Sighting;
 use crate::network::pose_net::PoseNet;
 use crate::pose::body_model::BodyModel;
 
-/// Least confidence of a sure landmark, and largest distance from the body, metres: beyond, it is another person's or on the wrong
-/// side.
+/// Least confidence of a sure landmark, and largest distance from the body, metres: beyond, it is another person's or on
+/// the wrong side.
 const SURE: f64 = 0.3;
 const GROSS_M: f64 = 0.15;
 /// Upper ends of the ranges of confidence whose spread is measured.
@@ -26,8 +26,8 @@ const RANGES: [f64; 8] = [0.05, 0.1, 0.2, 0.3, 0.5, 0.7, 0.9, 1.0];
 const ROUNDS: usize = 20;
 const ROBUST_M: f64 = 0.03;
 
-/// Observation of a landmark in one view: derivative of its place in the image plane by its bias, and that place relative to the
-/// body's, metres at the body's depth.
+/// Observation of a landmark in one view: derivative of its place in the image plane by its bias, and that place relative
+/// to the body's, metres at the body's depth.
 #[derive(Debug, Clone, Copy)]
 struct Sample {
     rows: [DVec3; 2],

@@ -26,8 +26,8 @@ impl BodyMark {
 
 /// Returns the landmarks' places on a template.
 ///
-/// Shoulders, elbows, wrists, hips, knees and ankles are joints; landmarks of face, hands and feet are places on the surface, since
-/// the network was trained on images that people annotated on the skin.
+/// Shoulders, elbows, wrists, hips, knees and ankles are joints; landmarks of face, hands and feet are places on the
+/// surface, since the network was trained on images that people annotated on the skin.
 ///
 /// # Errors
 /// Kind `Template` when head, feet or hands have no vertices.

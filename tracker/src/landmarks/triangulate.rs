@@ -22,9 +22,10 @@ pub struct WorldPoint {
 
 /// Triangulates every landmark that at least two views agree on.
 ///
-/// Pairs of views give candidates; the one that most views agree with (within `inlier_m` metres at its depth) wins and is refined by
-/// Gauss-Newton on reprojection residuals with Cauchy weights. `keypoints` are in rig order, `None` for cameras without landmarks.
-/// Unusable landmarks and those below the threshold are ignored, so poisoned input gives fewer points, never one that is not finite.
+/// Pairs of views give candidates; the one that most views agree with (within `inlier_m` metres at its depth) wins and is
+/// refined by Gauss-Newton on reprojection residuals with Cauchy weights. `keypoints` are in rig order, `None` for cameras
+/// without landmarks. Unusable landmarks and those below the threshold are ignored, so poisoned input gives fewer points,
+/// never one that is not finite.
 ///
 /// ```
 /// use flyrig_tracker::{Keypoint, LANDMARK_COUNT, triangulate};

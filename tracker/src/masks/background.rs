@@ -1,8 +1,9 @@
 //! The background of one camera: a plate that follows the room, or a screen of one colour.
 //!
 //! A plate ([`Plate`](crate::masks::plate::Plate)) is an image of the empty scene, recorded beforehand or learnt where no
-//! person stands. A [`KeyColor`] is known from the start. Either gives evidence for a foreground in the exposure of one image
-//! ([`BackgroundLight`]). The owner ingests every fourth frame set, and every one while the background is being learnt.
+//! person stands. A [`KeyColor`] is known from the start. Either gives evidence for a foreground in the exposure of one
+//! image ([`BackgroundLight`]). The owner ingests every fourth frame set, and every one while the background is being
+//! learnt.
 
 use flyrig_types::{Camera, Image, Mask};
 
@@ -126,8 +127,8 @@ impl Background {
         }
     }
 
-    /// Returns the person's mask from this background and the posed body alone; `None` when nothing stands out near the body
-    /// or the image has another size.
+    /// Returns the person's mask from this background and the posed body alone; `None` when nothing stands out near the
+    /// body or the image has another size.
     ///
     /// # Errors
     /// Kind `Image` when the format cannot be read.

@@ -27,8 +27,8 @@ pub(crate) fn corners(camera: &Camera, vertices: &[Vec3]) -> Corners {
     vertices.iter().map(corner).collect()
 }
 
-/// Returns the network's mask inside `bounds` (x0, y0, x1, y1, ends excluded), warped from the body `then` to the body `now`.
-/// Each cell moves by the mean motion of its visible vertices, cells without a vertex as their neighbours.
+/// Returns the network's mask inside `bounds` (x0, y0, x1, y1, ends excluded), warped from the body `then` to the body
+/// `now`. Each cell moves by the mean motion of its visible vertices, cells without a vertex as their neighbours.
 pub(crate) fn carried_mask(mask: &[f32], crop: Crop, then: &Corners, now: &Corners, bounds: [usize; 4]) -> Grid {
     let [x0, y0, x1, y1] = bounds;
     let cell = (2.0 * crop.scale()).max(2.0);

@@ -25,7 +25,8 @@ pub(crate) struct Drift {
 }
 
 impl Drift {
-    /// Measures gain and noise robustly (by medians) at pixels where `is_background`. `plate` holds three sRGB values per pixel.
+    /// Measures gain and noise robustly (by medians) at pixels where `is_background`. `plate` holds three sRGB values per
+    /// pixel.
     pub fn new(picture: &Rgb, plate: &[f32], is_background: &dyn Fn(usize) -> bool) -> Self {
         let away: Vec<usize> =
             (0..picture.width * picture.height).step_by(GAIN_STEP).filter(|at| is_background(*at)).collect();

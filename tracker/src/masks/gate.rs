@@ -116,8 +116,8 @@ impl BodyGate {
 /// Vertices per parallel task.
 const VERTICES_A_TASK: usize = 2048;
 
-/// Draws a posed body (world vertices, metres). Returns its bounding box with a margin in pixels (x0, y0, x1, y1, ends excluded) and
-/// a grid of that box that is 1 on the body; `None` when the body is out of the image.
+/// Draws a posed body (world vertices, metres). Returns its bounding box with a margin in pixels (x0, y0, x1, y1, ends
+/// excluded) and a grid of that box that is 1 on the body; `None` when the body is out of the image.
 pub(crate) fn drawn_body(
     camera: &Camera,
     vertices: &[Vec3],

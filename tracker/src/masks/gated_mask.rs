@@ -8,16 +8,16 @@ use flyrig_types::Mask;
 use crate::image::grid::{Grid, clean, components};
 use crate::masks::gate::BodyGate;
 
-/// Evidence added on the body, further evidence inside it in proportion to depth over [`DEEP_M`], and evidence taken off where
-/// most clothes end and beyond.
+/// Evidence added on the body, further evidence inside it in proportion to depth over [`DEEP_M`], and evidence taken off
+/// where most clothes end and beyond.
 const ON_BODY: f32 = 0.15;
 const DEEP_IN_BODY: f32 = 0.35;
 const OFF_BODY: f32 = 0.4;
 /// Depth in the body beyond which only a sure match of the background speaks against a person, metres.
 const DEEP_M: f64 = 0.04;
 
-/// Returns the mask, in the image's size, from evidence inside the gate's bounds and the body; `None` when nothing stands out near
-/// the body or the sizes differ.
+/// Returns the mask, in the image's size, from evidence inside the gate's bounds and the body; `None` when nothing stands
+/// out near the body or the sizes differ.
 pub(crate) fn gated_mask(evidence: &Grid, gate: &BodyGate) -> Option<Mask> {
     let ([x0, y0, ..], [width, height]) = (gate.bounds, gate.image);
     if (evidence.width, evidence.height) != (gate.distance.width, gate.distance.height) {

@@ -1,7 +1,8 @@
 //! Masks and mattes before a screen of one colour.
 //!
-//! A screen's chroma (linear light less its mean) lies along that of the key colour, and its strength varies slowly over the
-//! image with the lamps. Coverage is the missing share of the screen's chroma; chroma that remains on the foreground is spill.
+//! A screen's chroma (linear light less its mean) lies along that of the key colour, and its strength varies slowly over
+//! the image with the lamps. Coverage is the missing share of the screen's chroma; chroma that remains on the foreground is
+//! spill.
 
 use std::fmt;
 use std::str::FromStr;
@@ -25,6 +26,15 @@ const SHADOW: f32 = 0.35;
 const SPILL: f32 = 0.3;
 
 /// Colour of a screen behind the people.
+///
+/// ```
+/// use flyrig_tracker::KeyColor;
+///
+/// let key: KeyColor = "#00b140".parse()?;
+/// assert_eq!("green".parse::<KeyColor>()?, key);
+/// assert!("grey".parse::<KeyColor>().is_err(), "only saturated colours separate the screen from people");
+/// # Ok::<(), flyrig_tracker::KeyColorError>(())
+/// ```
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct KeyColor {
     rgb: [u8; 3],
@@ -129,7 +139,8 @@ impl KeyColor {
         Some(Screen { share, strength, light, is_screen })
     }
 
-    /// Returns evidence for a foreground inside `bounds` (x0, y0, x1, y1, ends excluded), 0..=1 with the border at one half.
+    /// Returns evidence for a foreground inside `bounds` (x0, y0, x1, y1, ends excluded), 0..=1 with the border at one
+    /// half.
     pub(crate) fn evidence(&self, picture: &Rgb, screen: &Screen, [x0, y0, x1, y1]: [usize; 4]) -> Grid {
         let mut evidence = Grid::new(x1 - x0, y1 - y0, 0.0);
         let key = dot(self.chroma, self.chroma).sqrt();
@@ -147,7 +158,8 @@ impl KeyColor {
         evidence
     }
 
-    /// Subtracts the screen's spill from the colours of a matte; does nothing when the image shows no screen of this colour.
+    /// Subtracts the screen's spill from the colours of a matte; does nothing when the image shows no screen of this
+    /// colour.
     pub(crate) fn despill(&self, picture: &Rgb, matte: &mut Matte) {
         let Some(screen) = self.screen(picture) else { return };
         let mut colors = Vec::new();

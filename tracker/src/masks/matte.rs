@@ -35,17 +35,17 @@ const REMAINDER: f32 = 60.0;
 const CHROMA: f32 = 0.8;
 /// Largest half width of a blurred outline, pixels.
 const BLUR_PX: f32 = 1.7;
-/// Range of the share of its light that a shadow leaves to the background, and the margin by which a mixture must explain a pixel
-/// beyond the mask better than a shadow does, squared standard deviations.
+/// Range of the share of its light that a shadow leaves to the background, and the margin by which a mixture must explain a
+/// pixel beyond the mask better than a shadow does, squared standard deviations.
 const SHADOWS: std::ops::RangeInclusive<f32> = 0.15..=1.05;
 const BETTER_THAN_SHADOW: f32 = 4.0;
-/// Largest depth of a mask pixel that is solved for because it looks like the background, pixels, and the evidence below which
-/// it does.
+/// Largest depth of a mask pixel that is solved for because it looks like the background, pixels, and the evidence below
+/// which it does.
 const DEEP_PX: f32 = 24.0;
 const LOOKS_EMPTY: f32 = 0.4;
 
-/// Solves for coverage and foreground colour along the outline of a mask. Without a background, or where it has another size,
-/// the colours around the mask are used.
+/// Solves for coverage and foreground colour along the outline of a mask. Without a background, or where it has another
+/// size, the colours around the mask are used.
 ///
 /// ```
 /// use flyrig_tracker::matte;
@@ -350,8 +350,8 @@ impl<'a> Band<'a> {
     }
 }
 
-/// Sets alpha to 0 or 1 beyond the blur of a lens around the solved outline: there, a mixture is a shade of the foreground or a
-/// shadow on the background.
+/// Sets alpha to 0 or 1 beyond the blur of a lens around the solved outline: there, a mixture is a shade of the foreground
+/// or a shadow on the background.
 fn sharpen(alphas: &mut Grid) {
     let mut unset = alphas.clone();
     unset.values.iter_mut().for_each(|alpha| *alpha = 1.0 - *alpha);
@@ -374,8 +374,8 @@ struct Mixed {
     belief: f32,
 }
 
-/// Returns weighted brightness and two colour differences; the latter count less, since cameras and codecs blur them over the
-/// outline.
+/// Returns weighted brightness and two colour differences; the latter count less, since cameras and codecs blur them over
+/// the outline.
 fn weighted([red, green, blue]: [f32; 3]) -> [f32; 3] {
     let light = 0.3 * red + 0.59 * green + 0.11 * blue;
     [1.7 * light, CHROMA * (red - light), CHROMA * (blue - light)]

@@ -1,8 +1,8 @@
 //! The plate: an image of the empty scene that follows the room.
 //!
-//! Pixels that no person reaches follow slow changes of the light. A pixel that differs for long is relearnt, all pixels are
-//! after a sudden change of most of them (a switched lamp) or a shift (a camera that was moved). An unknown pixel counts as
-//! known once it has kept its colour for a while.
+//! Pixels that no person reaches follow slow changes of the light. A pixel that differs for long is relearnt, all pixels
+//! are after a sudden change of most of them (a switched lamp) or a shift (a camera that was moved). An unknown pixel
+//! counts as known once it has kept its colour for a while.
 
 use crate::image::pixels::Rgb;
 use crate::masks::background_event::BackgroundEvent;
@@ -23,7 +23,8 @@ const STEADY: f32 = 14.0;
 const DIFFERENT_UPDATES: u8 = 15;
 /// Share of the difference that the plate adopts per update.
 const FOLLOW: f32 = 1.0 / 16.0;
-/// Period, in updates, in which pixels near a person are learnt: a part of the person that the mask misses has time to move.
+/// Period, in updates, in which pixels near a person are learnt: a part of the person that the mask misses has time to
+/// move.
 const CLEAR_EVERY: u32 = 4;
 /// Updates for which a background that is being learnt asks for every image.
 const EAGER_UPDATES: u32 = 60;

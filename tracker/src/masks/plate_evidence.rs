@@ -1,7 +1,7 @@
 //! Evidence for a foreground: differences of an image from the empty scene of the same camera.
 //!
-//! A pixel's colour is split into brightness along the plate's colour and a remainder (Horprasert, Harwood and Davis 1999). A
-//! remainder beyond the image's own noise, or a brightness that no shadow explains, is foreground.
+//! A pixel's colour is split into brightness along the plate's colour and a remainder (Horprasert, Harwood and Davis 1999).
+//! A remainder beyond the image's own noise, or a brightness that no shadow explains, is foreground.
 
 use rayon::prelude::*;
 
@@ -14,8 +14,8 @@ const SHADOW: f32 = 0.45;
 /// Evidence where the background is unknown.
 pub(crate) const NO_EVIDENCE: f32 = 0.5;
 
-/// Returns per-pixel evidence for a foreground inside `bounds` (x0, y0, x1, y1, ends excluded), 0..=1 with the border at one
-/// half; `None` when the sizes differ. `plate` holds three sRGB values per pixel.
+/// Returns per-pixel evidence for a foreground inside `bounds` (x0, y0, x1, y1, ends excluded), 0..=1 with the border at
+/// one half; `None` when the sizes differ. `plate` holds three sRGB values per pixel.
 pub(crate) fn plate_evidence(picture: &Rgb, plate: &[f32], drift: &Drift, bounds: [usize; 4]) -> Option<Grid> {
     let [x0, y0, x1, y1] = bounds;
     if plate.len() != picture.bytes.len() || x1 > picture.width || y1 > picture.height {

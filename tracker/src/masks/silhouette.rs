@@ -1,7 +1,7 @@
 //! Masks from the network's coarse mask, sharpened on the image and gated by the fitted body.
 //!
-//! The probability is joined with a colour model of person and surroundings, evidence from the background where it is known,
-//! and the distance to the body, then smoothed along the image's edges by a guided filter (He et al. 2010).
+//! The probability is joined with a colour model of person and surroundings, evidence from the background where it is
+//! known, and the distance to the body, then smoothed along the image's edges by a guided filter (He et al. 2010).
 
 use flyrig_types::Mask;
 use glam::DVec2;
@@ -24,8 +24,8 @@ const BINS: usize = 16;
 const CLOTHES: f32 = 0.2;
 const FADE: f32 = 0.1;
 
-/// Returns the network's probability of a person inside the gate's bounds, or one from the body alone where the network has no
-/// mask.
+/// Returns the network's probability of a person inside the gate's bounds, or one from the body alone where the network has
+/// no mask.
 pub(crate) fn coarse_mask(sighting: &Sighting, gate: &BodyGate) -> Grid {
     let [x0, y0, x1, y1] = gate.bounds;
     let Some(mask) = &sighting.output.mask else { return body_mask(gate) };
@@ -48,9 +48,10 @@ fn body_mask(gate: &BodyGate) -> Grid {
 
 /// Returns the person's mask at the image's size; `None` when it is empty.
 ///
-/// `coarse` is the network's probability inside the gate's bounds and `crop_scale` the size of one of its pixels in pixels of
-/// the image. The colour model consists of histograms of this image's own sure regions. Evidence from the background, inside the
-/// gate's bounds, finds thin parts that the coarse mask misses, and the coarse mask finds parts of the background's colour.
+/// `coarse` is the network's probability inside the gate's bounds and `crop_scale` the size of one of its pixels in pixels
+/// of the image. The colour model consists of histograms of this image's own sure regions. Evidence from the background,
+/// inside the gate's bounds, finds thin parts that the coarse mask misses, and the coarse mask finds parts of the
+/// background's colour.
 pub(crate) fn refine(
     picture: &Rgb,
     coarse: &Grid,

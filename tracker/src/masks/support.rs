@@ -1,7 +1,8 @@
 //! Clears mask fragments that no other camera supports.
 //!
-//! A passer-by behind the person, or a screen that lights up there, differs from the plate as a sleeve does, but lies beside the
-//! body in one image only. A part of the person appears in every camera that views its place: a visual hull test along the ray.
+//! A passer-by behind the person, or a screen that lights up there, differs from the plate as a sleeve does, but lies
+//! beside the body in one image only. A part of the person appears in every camera that views its place: a visual hull test
+//! along the ray.
 
 use flyrig_types::{Camera, Mask};
 use glam::{DVec2, DVec3};
@@ -56,9 +57,9 @@ impl Coarse {
     }
 }
 
-/// Clears components of `masks` beside the body that lie, at every depth that clothes may have, outside the masks of the other
-/// cameras that view the place (all of up to three, all but one of more). Slices are in rig order; cameras without a mask or a gate
-/// are ignored. The person must be alone: another one would hide parts that a mask should have.
+/// Clears components of `masks` beside the body that lie, at every depth that clothes may have, outside the masks of the
+/// other cameras that view the place (all of up to three, all but one of more). Slices are in rig order; cameras without a
+/// mask or a gate are ignored. The person must be alone: another one would hide parts that a mask should have.
 pub(crate) fn drop_unsupported(cameras: &[Camera], gates: &[Option<BodyGate>], masks: &mut [Option<Mask>]) {
     let side_px = |gate: &BodyGate| (SQUARE_M * gate.px_per_m).round().max(MIN_SQUARE_PX) as usize;
     let coarse: Vec<Option<Coarse>> = masks

@@ -1,4 +1,5 @@
-//! A landmark network of the user's choice: input in its format, landmarks from points, heatmaps or SimCC bins (Li et al. 2022).
+//! A landmark network of the user's choice: input in its format, landmarks from points, heatmaps or SimCC bins (Li et al.
+//! 2022).
 
 use std::path::Path;
 use std::sync::Arc;

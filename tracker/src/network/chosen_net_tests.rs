@@ -62,7 +62,7 @@ fn node(op: &str, output: &str, attribute: Vec<pb::AttributeProto>) -> pb::NodeP
     }
 }
 
-/// An ONNX file of nodes on one image.
+/// Returns an ONNX file of nodes on one image.
 fn onnx(input: &[i64], nodes: Vec<pb::NodeProto>, outputs: Vec<pb::ValueInfoProto>) -> Vec<u8> {
     let graph = pb::GraphProto {
         node: nodes,
@@ -81,7 +81,7 @@ fn heatmap_onnx(input: &[i64]) -> Vec<u8> {
     onnx(input, vec![pool], vec![value("maps", &[1, 3, 16, 12])])
 }
 
-/// The highest value of each channel by column, and by row.
+/// Nodes that take the highest value of each channel by column, and by row.
 fn simcc_onnx(input: &[i64]) -> Vec<u8> {
     let reduce = |output, axis| {
         let keep = pb::AttributeProto {
@@ -100,7 +100,7 @@ const IMAGE: usize = 200;
 /// Red, green and blue spot in the image.
 const PLACES: [[f64; 2]; 3] = [[90.0, 70.0], [110.0, 72.0], [101.0, 120.0]];
 
-/// An image with a spot of each colour.
+/// Returns an image with a spot of each colour.
 fn picture() -> Rgb<'static> {
     let brightness = |x: usize, y: usize, [cx, cy]: [f64; 2]| {
         let d2 = (x as f64 - cx).powi(2) + (y as f64 - cy).powi(2);
@@ -110,7 +110,7 @@ fn picture() -> Rgb<'static> {
     Rgb { width: IMAGE, height: IMAGE, bytes: (0..IMAGE * IMAGE).flat_map(pixel).collect() }
 }
 
-/// A turned crop around the spots.
+/// Returns a rotated crop around the spots.
 fn crop() -> Crop {
     Crop { center: DVec2::new(100.0, 95.0), side: 96.0, turn: DVec2::from_angle(0.2) }
 }

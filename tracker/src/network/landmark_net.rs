@@ -37,7 +37,8 @@ impl LandmarkNet {
         })
     }
 
-    /// Loads an ONNX file. `shape` chooses the shape of the input from its sides; those that the file leaves open are `None`.
+    /// Loads an ONNX file. `shape` chooses the shape of the input from its sides; those that the file leaves open are
+    /// `None`.
     ///
     /// # Errors
     /// Kind [`TrackErrorKind::Net`] when the file does not load, or with the message of `shape`.

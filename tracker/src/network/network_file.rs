@@ -19,7 +19,7 @@ const MOST_BYTES: u64 = 1 << 30;
 #[derive(Debug, Clone, PartialEq, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub(crate) struct NetworkFile {
-    /// The ONNX file, beside the description unless absolute.
+    /// ONNX file, relative to the description unless absolute.
     pub file: PathBuf,
     /// Width and height of the input, pixels; needed where the ONNX file leaves them open.
     pub input: Option<[usize; 2]>,

@@ -14,8 +14,8 @@ pub struct CropLandmark {
     pub y: f64,
     /// Smaller of the probabilities that the landmark is visible and that it lies in the crop.
     pub confidence: f64,
-    /// Metres from the middle of the hips, axes of the crop: x right, y down, z away from the camera; `None` where the network
-    /// gives no depth.
+    /// Metres from the middle of the hips, axes of the crop: x right, y down, z away from the camera; `None` where the
+    /// network gives no depth.
     pub world: Option<[f64; 3]>,
 }
 

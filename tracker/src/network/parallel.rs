@@ -5,9 +5,9 @@ use rayon::prelude::*;
 /// Returns `work` of every index below `count`, in order.
 ///
 /// With two or more cores per run, all run at once on threads of their own, and their networks' products share the cores
-/// ([`LandmarkNet::run`](crate::network::landmark_net::LandmarkNet::run)). Otherwise as many as there are cores run in parallel on
-/// rayon's threads, where a network uses a single core; the few that are left over run in sequence on this thread, each on all
-/// cores.
+/// ([`LandmarkNet::run`](crate::network::landmark_net::LandmarkNet::run)). Otherwise as many as there are cores run in
+/// parallel on rayon's threads, where a network uses a single core; the few that are left over run in sequence on this
+/// thread, each on all cores.
 pub(crate) fn map_parallel<T: Send>(count: usize, work: impl Fn(usize) -> T + Sync + Send) -> Vec<T> {
     let threads = rayon::current_num_threads().max(1);
     if count > 1 && threads >= 2 * count && rayon::current_thread_index().is_none() {

@@ -17,8 +17,8 @@ const NET_LANDMARKS: usize = 39;
 
 static EMBEDDED: &[u8] = include_bytes!("../../assets/pose_full.onnx");
 
-/// Network that finds a person's landmarks: the one built in (BlazePose full; licence beside the file in `assets`), or one of the
-/// user's choice.
+/// Network that finds a person's landmarks: the one built in (BlazePose full; licence beside the file in `assets`), or one
+/// of the user's choice.
 #[derive(Clone)]
 pub struct PoseNet {
     kind: Kind,

@@ -4,8 +4,8 @@ use tract_onnx::prelude::*;
 use tract_onnx::tract_core::internal::*;
 use tract_onnx::tract_core::ops::nn::resize::{CoordTransformer, Interpolator, Resize};
 
-/// Operator that doubles the last two axes of an `f32` tensor; pixel centres at half-integers ("half_pixel" of ONNX), borders
-/// repeat.
+/// Operator that doubles the last two axes of an `f32` tensor; pixel centres at half-integers ("half_pixel" of ONNX),
+/// borders repeat.
 #[derive(Debug, Clone, Hash, PartialEq, Eq)]
 struct Upsample;
 

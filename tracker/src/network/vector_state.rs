@@ -1,8 +1,8 @@
 //! Clears the vector registers after a network's products.
 //!
-//! tract's products (0.23, written in assembly) return without `vzeroupper`. The upper halves of the vector registers then still
-//! are in use, and on x86 processors every SSE instruction of the thread must merge with them until they are cleared: box means ran
-//! 3.5 times slower on threads that had run a network.
+//! tract's products (0.23, written in assembly) return without `vzeroupper`. The upper halves of the vector registers then
+//! still are in use, and on x86 processors every SSE instruction of the thread must merge with them until they are cleared:
+//! box means ran 3.5 times slower on threads that had run a network.
 
 use tract_onnx::prelude::*;
 use tract_onnx::tract_core::internal::*;

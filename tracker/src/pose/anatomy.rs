@@ -86,7 +86,8 @@ impl Roles {
     }
 }
 
-/// Range of a joint's rotation away from the bind pose: limits and standard deviations of the components of its rotation vector.
+/// Range of a joint's rotation away from the bind pose: limits and standard deviations of the components of its rotation
+/// vector.
 #[derive(Debug, Clone, PartialEq)]
 pub(crate) struct JointRange {
     /// Columns: flexion axis, twist axis, third axis; canonical axes.

@@ -8,8 +8,8 @@ use serde::{Deserialize, Serialize};
 pub struct PoseConfig {
     /// Least presence of a crop that shows a person, 0..=1.
     pub presence_threshold: f64,
-    /// Least confidence of a visible landmark (the smaller of visibility and presence), 0..=1. Hidden ones do not count as a sign of
-    /// a person and are not triangulated, but the fit uses the network's estimate of their place.
+    /// Least confidence of a visible landmark (the smaller of visibility and presence), 0..=1. Hidden ones do not count as
+    /// a sign of a person and are not triangulated, but the fit uses the network's estimate of their place.
     pub confidence_threshold: f64,
     /// Largest residual at which a view agrees on a landmark, metres at its depth.
     pub inlier_m: f64,
@@ -17,23 +17,26 @@ pub struct PoseConfig {
     pub landmark_spread: f64,
     /// Standard deviation of the body's outline from the mask's (clothes, the body's shape), metres.
     pub outline_sigma_m: f64,
-    /// Rounds per frame set in which the body's outline is matched with the masks and its texture with the images; 0 fits the pose to
-    /// landmarks alone.
+    /// Rounds per frame set in which the body's outline is matched with the masks and its texture with the images; 0 fits
+    /// the pose to landmarks alone.
     pub outline_rounds: usize,
     /// Height of the person, metres; `None` measures it.
     pub height_m: Option<f64>,
-    /// Height of the floor in the world, along the rig's up, metres. Without [`Self::height_m`], a single camera measures people by
-    /// where their feet stand.
+    /// Height of the floor in the world, along the rig's up, metres. Without [`Self::height_m`], a single camera measures
+    /// people by where their feet stand.
     pub floor_m: f64,
-    /// Rounds in which [`crate::PoseEstimator::measure_shape`] matches outlines with masks to solve for lengths, girths, build and
-    /// poses together; 0 fits bone lengths to landmarks alone (docs/benchmarks/perception.md, "Shape from outlines").
+    /// Rounds in which [`crate::PoseEstimator::measure_shape`] matches outlines with masks to solve for lengths, girths,
+    /// build and poses together; 0 fits bone lengths to landmarks alone (docs/benchmarks/perception.md, "Shape from
+    /// outlines").
     pub shape_rounds: usize,
-    /// Standard deviation of a joint's rotation between frame sets at 30 frame sets per second, radians; smaller is smoother.
+    /// Standard deviation of a joint's rotation between frame sets at 30 frame sets per second, radians; smaller is
+    /// smoother.
     pub smooth_rad: f64,
-    /// Distance that the body moves in a view until the network runs on that view again, metres; 0 runs it on every view of every
-    /// frame set.
+    /// Distance that the body moves in a view until the network runs on that view again, metres; 0 runs it on every view of
+    /// every frame set.
     pub look_after_m: f64,
-    /// Most views with an earlier inference that the network runs on again per frame set, the stalest first; 0 for all that are due.
+    /// Most views with an earlier inference that the network runs on again per frame set, the stalest first; 0 for all that
+    /// are due.
     pub max_inferences: usize,
     /// Largest number of solver steps per frame set.
     pub max_steps: usize,

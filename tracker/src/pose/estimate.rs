@@ -29,8 +29,8 @@ pub struct ViewQuality {
     pub inliers: usize,
     /// Median distance in pixels between the usable landmarks and the fitted body's; `None` without any.
     pub residual_px: Option<f64>,
-    /// Intersection over union of the mask and the fitted body's silhouette, 0..=1; `None` without a mask. Clothes and hair keep it
-    /// below 1; a low value means that the body is off the person.
+    /// Intersection over union of the mask and the fitted body's silhouette, 0..=1; `None` without a mask. Clothes and hair
+    /// keep it below 1; a low value means that the body is off the person.
     pub mask_overlap: Option<f64>,
     /// Reason why there is no mask; `None` when there is one.
     pub no_mask: Option<NoMask>,

@@ -1,8 +1,9 @@
 //! The pose estimator of one person: frame sets in, poses and masks out.
 //!
-//! One frame set in steps: landmarks of the due views ([`follow`]), a pose fitted to them, masks gated by that body ([`masks`]), then
-//! the pose whose outline lies on that of the masks and whose surface shows the brightness that each camera remembers of it
-//! ([`refine`]). A person who is lost is searched for over several frame sets. [`shape`] measures the person's shape.
+//! One frame set in steps: landmarks of the due views ([`follow`]), a pose fitted to them, masks gated by that body
+//! ([`masks`]), then the pose whose outline lies on that of the masks and whose surface shows the brightness that each
+//! camera remembers of it ([`refine`]). A person who is lost is searched for over several frame sets. [`shape`] measures
+//! the person's shape.
 
 mod follow;
 mod masks;
@@ -90,7 +91,28 @@ impl Track {
     }
 }
 
-/// Tracks one person through the frame sets of a rig.
+/// Tracker of one person through the frame sets of a rig.
+///
+/// ```no_run
+/// use flyrig_body::{ShapeParams, default_template};
+/// use flyrig_tracker::{PoseConfig, PoseEstimator, PoseNet, TrackErrorKind};
+/// use flyrig_types::{FrameSet, Rig};
+///
+/// fn track(rig: &Rig, first: &[FrameSet], rest: &[FrameSet]) -> Result<(), Box<dyn std::error::Error>> {
+///     let template = default_template(&ShapeParams::default())?;
+///     let mut estimator = PoseEstimator::new(PoseNet::embedded()?, &template, rig, PoseConfig::default())?;
+///     let (shape, _) = estimator.fit_shape(first, &[])?;
+///     println!("the person is {shape}");
+///     for set in first.iter().chain(rest) {
+///         match estimator.estimate(set) {
+///             Ok(estimate) => println!("root at {} m", estimate.pose.root_translation),
+///             Err(error) if error.kind == TrackErrorKind::Lost => println!("{error}"),
+///             Err(error) => return Err(error.into()),
+///         }
+///     }
+///     Ok(())
+/// }
+/// ```
 #[derive(Debug, Clone)]
 pub struct PoseEstimator {
     net: PoseNet,
@@ -262,8 +284,8 @@ impl PoseEstimator {
         std::mem::replace(&mut self.backgrounds, vec![None; self.rig.cameras.len()])
     }
 
-    /// Replaces a camera that has moved, from the next frame set on. Its last inference is forgotten; its background stays. Slots that
-    /// do not exist are ignored.
+    /// Replaces a camera that has moved, from the next frame set on. Its last inference is forgotten; its background stays.
+    /// Slots that do not exist are ignored.
     pub fn move_camera(&mut self, slot: usize, camera: &Camera) {
         if let Some(known) = self.rig.cameras.get_mut(slot) {
             known.clone_from(camera);
@@ -308,14 +330,14 @@ impl PoseEstimator {
     /// Estimates pose, masks and quality of one frame set; frame sets come in order of time.
     ///
     /// # Errors
-    /// Kind `Lost` when no person was found: call again with the next frame set, the search continues. Kinds `Frames`, `Image` and
-    /// `Net` when the input is not usable. The state stays valid in any case.
+    /// Kind `Lost` when no person was found: call again with the next frame set, the search continues. Kinds `Frames`,
+    /// `Image` and `Net` when the input is not usable. The state stays valid in any case.
     pub fn estimate(&mut self, set: &FrameSet) -> Result<PoseEstimate, TrackError> {
         self.estimate_among(set, &[], true)
     }
 
-    /// Estimates as [`Self::estimate`] does, beside other people whose landmarks are known: sightings of them are rejected. Without
-    /// `may_search` a person who cannot be tracked is lost in this frame set.
+    /// Estimates as [`Self::estimate`] does, beside other people whose landmarks are known: sightings of them are rejected.
+    /// Without `may_search` a person who cannot be tracked is lost in this frame set.
     ///
     /// # Errors
     /// Those of [`Self::estimate`].
@@ -414,8 +436,8 @@ impl PoseEstimator {
         if self.track.is_some() { self.lost } else { self.lost.max(1) }
     }
 
-    /// Sets the person's clothes: masks reach less far from the body once they are known, so that things and people nearby are no
-    /// part of them, and the pose is fitted to the outlines of the shoes.
+    /// Sets the person's clothes: masks reach less far from the body once they are known, so that things and people nearby
+    /// are no part of them, and the pose is fitted to the outlines of the shoes.
     ///
     /// # Errors
     /// Kind `Template` for a body that cannot wear them.
@@ -450,14 +472,16 @@ impl PoseEstimator {
         self.lost = self.lost.max(1);
     }
 
-    /// Takes over the person tracked by another estimator, from the next frame set on; the other one has then lost the person.
+    /// Takes over the person tracked by another estimator, from the next frame set on; the other one has then lost the
+    /// person.
     pub fn take_track(&mut self, other: &mut Self) {
         self.track = other.track.take();
         self.lost = 0;
         other.lost = 1;
     }
 
-    /// Skins a pose at a delay after its time, extrapolated by the motion since the last frame set. Returns world vertices and normals.
+    /// Skins a pose at a delay after its time, extrapolated by the motion since the last frame set. Returns world vertices
+    /// and normals.
     fn skinned(&self, turns: &JointTurns, set: &FrameSet, delay_secs: f64) -> (Vec<Vec3>, Vec<Vec3>) {
         self.skinned_in(&self.surface, turns, set, delay_secs)
     }
@@ -477,8 +501,8 @@ impl PoseEstimator {
         skin_mesh(template, &self.model.to_pose(moved.as_ref().unwrap_or(turns)))
     }
 
-    /// Returns the world positions of the landmarks on the template in a pose, metres; `None` for a pose that does not fit the
-    /// template.
+    /// Returns the world positions of the landmarks on the template in a pose, metres; `None` for a pose that does not fit
+    /// the template.
     #[must_use]
     pub fn landmarks(&self, pose: &flyrig_types::Pose) -> Option<Marks> {
         self.model.to_turns(pose).map(|turns| self.model.marks(&turns))

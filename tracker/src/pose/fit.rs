@@ -1,9 +1,9 @@
 //! Damped least squares of a body's joint rotations on landmarks, outlines and texture.
 //!
-//! The cost is half the sum of squared residuals over their standard deviations: landmark distances in the images and to world
-//! points (Cauchy weights), distances of the body's outline from the masks' and of its texture from the lines of its brightness
-//! (Geman-McClure weights), joint ranges, and the change since the last pose. Levenberg-Marquardt with analytic derivatives accepts
-//! only steps that lower the cost.
+//! The cost is half the sum of squared residuals over their standard deviations: landmark distances in the images and to
+//! world points (Cauchy weights), distances of the body's outline from the masks' and of its texture from the lines of its
+//! brightness (Geman-McClure weights), joint ranges, and the change since the last pose. Levenberg-Marquardt with analytic
+//! derivatives accepts only steps that lower the cost.
 
 use flyrig_solve::{
     Convergence, DenseNormal, Kernel, PointPair, Problem, align_rigid, exp_rotation, left_jacobian_inverse,
@@ -36,8 +36,8 @@ const LANDMARK_WEIGHT: [f64; LANDMARK_COUNT] = {
 
 /// Standard deviation beyond a joint's limit, radians.
 const LIMIT_SIGMA: f64 = 0.05;
-/// Number of independent measurements that the line points of a view are worth: more points share their weight, since the errors of
-/// neighbours are correlated.
+/// Number of independent measurements that the line points of a view are worth: more points share their weight, since the
+/// errors of neighbours are correlated.
 const OUTLINE_COUNT: f64 = 80.0;
 const TEXTURE_COUNT: f64 = 20.0;
 /// Distance at which a line point loses three quarters of its weight, standard deviations: it belongs to another edge.
@@ -150,7 +150,8 @@ impl FitProblem<'_> {
         }
     }
 
-    /// Calls `each` with every line point, the derivative of its residual by its world place, the residual, the weight and the cost.
+    /// Calls `each` with every line point, the derivative of its residual by its world place, the residual, the weight and
+    /// the cost.
     fn line_terms(&self, posed: &PosedSkeleton, mut each: impl FnMut(&LinePoint, DVec3, f64, f64, f64)) {
         let mut counts = vec![[0.0f64; 2]; self.views.len()];
         for point in self.lines {
@@ -204,8 +205,8 @@ impl FitProblem<'_> {
         }
     }
 
-    /// Minimises from a start; returns the best pose found and the number of steps. `None` when even the start has no finite
-    /// cost.
+    /// Minimises from a start; returns the best pose found and the number of steps. `None` when even the start has no
+    /// finite cost.
     pub fn solve(&self, start: &JointTurns, max_steps: usize) -> Option<(JointTurns, usize)> {
         let options = Convergence { max_steps, min_gain: 1e-4, ..Convergence::default() };
         minimize(self, start, &options).map(|solution| (solution.unknowns, solution.steps))
@@ -344,7 +345,8 @@ impl FitProblem<'_> {
     }
 }
 
-/// Derivatives of a model by the parameters of its shape, canonical metres; indexed by parameter, then joint, landmark or vertex.
+/// Derivatives of a model by the parameters of its shape, canonical metres; indexed by parameter, then joint, landmark or
+/// vertex.
 #[derive(Debug, Clone, Default)]
 pub(crate) struct ShapeDerivatives {
     pub count: usize,
@@ -391,8 +393,8 @@ impl DataTerm {
     }
 }
 
-/// Returns the bind pose moved so that trunk and head lie on world points (metres); `None` with fewer than three points, or where
-/// they are collinear.
+/// Returns the bind pose moved so that trunk and head lie on world points (metres); `None` with fewer than three points, or
+/// where they are collinear.
 pub(crate) fn align_trunk(model: &BodyModel, points: &[Option<DVec3>; LANDMARK_COUNT]) -> Option<JointTurns> {
     const TRUNK: [usize; 9] = [0, 7, 8, 11, 12, 23, 24, 25, 26];
     let pairs: Vec<PointPair> = TRUNK
@@ -430,7 +432,7 @@ mod tests {
             .collect()
     }
 
-    /// With 12 mm or so for each landmark: these are better than the network's.
+    /// Spread of about 12 mm for each landmark: these are better than the network's.
     fn problem<'a>(model: &'a BodyModel, views: &'a [FitView]) -> FitProblem<'a> {
         fit_problem(model, views, 0.6)
     }

@@ -62,7 +62,8 @@ impl<'a> BareBody<'a> {
         Self { body, by_place }
     }
 
-    /// Attaches a point of a dressed body to the nearest vertex of the bare one, at its offset, so that it moves with the body's shape.
+    /// Attaches a point of a dressed body to the nearest vertex of the bare one, at its offset, so that it moves with the
+    /// body's shape.
     pub fn undress(&self, point: &mut LinePoint, dressed: &Template) {
         let Some(at) = dressed.positions.get(point.vertex) else { return };
         let bare = &self.body.positions;
@@ -79,7 +80,8 @@ fn key(at: Vec3) -> [u32; 3] {
     at.to_array().map(f32::to_bits)
 }
 
-/// Returns the joints that carry a vertex, their weights (sum 1) and the vertex relative to each joint's origin, canonical metres.
+/// Returns the joints that carry a vertex, their weights (sum 1) and the vertex relative to each joint's origin, canonical
+/// metres.
 pub(crate) fn bones(model: &BodyModel, template: &Template, vertex: usize) -> Vec<(usize, f64, DVec3)> {
     let (point, skin) = (template.positions[vertex].as_dvec3(), &template.skin[vertex]);
     let total: f64 = skin.weights.iter().filter(|w| **w > 0.0).map(|w| f64::from(*w)).sum();

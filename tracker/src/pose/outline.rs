@@ -1,7 +1,7 @@
 //! Matches of the posed body's outline with the outline of a mask.
 //!
-//! Rim vertices (normal across the line of sight, body ends beside them) are thinned to one per cell and matched with the nearest
-//! end of the mask along the outline's normal.
+//! Rim vertices (normal across the line of sight, body ends beside them) are thinned to one per cell and matched with the
+//! nearest end of the mask along the outline's normal.
 
 use flyrig_body::Template;
 use flyrig_types::{Camera, Mask};
@@ -31,8 +31,8 @@ pub(crate) struct SeenBody<'a> {
 }
 
 impl SeenBody<'_> {
-    /// Matches points on the body's outline with the mask's within `reach_m` metres along the outline's normal. Ends of the mask at the
-    /// image's border are ignored. `sigma_m` is the standard deviation of the distance, metres.
+    /// Matches points on the body's outline with the mask's within `reach_m` metres along the outline's normal. Ends of the
+    /// mask at the image's border are ignored. `sigma_m` is the standard deviation of the distance, metres.
     pub fn match_mask(&self, mask: &Mask, view: usize, reach_m: f64, sigma_m: f64) -> Vec<LinePoint> {
         let Some((bounds, body)) = drawn_body(self.camera, self.vertices, &self.template.triangles, 8.0) else {
             return Vec::new();

@@ -1,8 +1,8 @@
 //! Remembered brightness of the body's surface per camera, and the motion of the body that shows it there again.
 //!
-//! Landmarks of a network scatter anew in every frame set. The surface does not: a fold or a stripe keeps its place on the body, so
-//! its motion in the images is that of the bones. Each camera remembers its own brightness of each point, so that neither
-//! differences between cameras nor light from one side disturb the comparison.
+//! Landmarks of a network scatter anew in every frame set. The surface does not: a fold or a stripe keeps its place on the
+//! body, so its motion in the images is that of the bones. Each camera remembers its own brightness of each point, so that
+//! neither differences between cameras nor light from one side disturb the comparison.
 
 use flyrig_body::Template;
 use flyrig_types::{Camera, Mask};
@@ -34,8 +34,8 @@ const SIGMA_CELLS: f64 = 0.3;
 const VAGUE_CELLS: f64 = 4.0;
 /// Expected displacement of a surface, cells: a mismatch of slopes counts over this distance.
 const DOUBT_CELLS: f64 = 1.0;
-/// Share of a new brightness in the memory, once a point was seen twice. A slow memory would keep the errors of the pose in which it
-/// was learnt.
+/// Share of a new brightness in the memory, once a point was seen twice. A slow memory would keep the errors of the pose in
+/// which it was learnt.
 const LEARN: f64 = 0.6;
 /// Time after which a hidden point is relearnt, seconds: it reappears in other light.
 const FORGET_SECS: f64 = 0.5;
@@ -57,7 +57,8 @@ pub(crate) struct Brightness {
 }
 
 impl Brightness {
-    /// Smooths the part of an image that shows the vertices (world metres), with a margin. `None` when they are out of the image.
+    /// Smooths the part of an image that shows the vertices (world metres), with a margin. `None` when they are out of the
+    /// image.
     pub fn around(picture: &Rgb<'_>, camera: &Camera, view: &View, vertices: &[Vec3]) -> Option<[Self; LEVELS]> {
         let (mut low, mut high) = (DVec2::INFINITY, DVec2::NEG_INFINITY);
         let mut scales = Vec::new();

@@ -50,8 +50,8 @@ impl Viewers {
         Ok(Self { alone, together: PoseEstimator::new(net.clone(), template, rig, together)?, sets: 0 })
     }
 
-    /// Estimates the pose in each image of a frame set independently. Timestamps matter only to locate a person whom a camera does not
-    /// find alone. Returns `None` for slots without an image or a person.
+    /// Estimates the pose in each image of a frame set independently. Timestamps matter only to locate a person whom a
+    /// camera does not find alone. Returns `None` for slots without an image or a person.
     ///
     /// # Errors
     /// Those of [`PoseEstimator::estimate`] but `Lost`.

@@ -25,7 +25,7 @@ pub(crate) const GIRTHS: [&str; 5] = ["trunk-depth", "arm-girth", "thigh-girth",
 /// Targets of the built-in body.
 const TARGETS: [&str; 6] = ["gender", "weight", "muscle", "age", "height", "proportions"];
 
-/// A template whose shape has parameters: the whole-body scale, lengths, girths, and the targets of the built-in body.
+/// Template with parameters of shape: the whole-body scale, lengths, girths, and the targets of the built-in body.
 #[derive(Debug, Clone)]
 pub(crate) struct ShapeSpace {
     base: Template,
@@ -131,8 +131,8 @@ fn stretches(model: &BodyModel, factors: &BTreeMap<String, f64>) -> Vec<DMat3> {
     stretch
 }
 
-/// Stretches a template by factors named as in [`LENGTHS`] and [`GIRTHS`], and `scale`; missing ones are 1. Vertices move with the
-/// bones that carry them.
+/// Stretches a template by factors named as in [`LENGTHS`] and [`GIRTHS`], and `scale`; missing ones are 1. Vertices move
+/// with the bones that carry them.
 ///
 /// # Errors
 /// Kind `Template` when the fitted skeleton is not valid.

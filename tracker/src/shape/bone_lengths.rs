@@ -103,11 +103,11 @@ impl ShapeFit {
     }
 }
 
-/// Scales a template to a person: the whole body, and each group of bones along its own direction, by the median distances between
-/// triangulated landmarks over a few frame sets.
+/// Scales a template to a person: the whole body, and each group of bones along its own direction, by the median distances
+/// between triangulated landmarks over a few frame sets.
 ///
-/// `keypoints[set][slot]` are the landmarks of one person, slots in rig order. Needs two views in at least one frame set. Vertices
-/// move with the bones that carry them, so that flesh keeps its thickness apart from `scale`.
+/// `keypoints[set][slot]` are the landmarks of one person, slots in rig order. Needs two views in at least one frame set.
+/// Vertices move with the bones that carry them, so that flesh keeps its thickness apart from `scale`.
 ///
 /// # Errors
 /// Kind `Lost` when too few lengths were measured or they are implausible; kind `Template` when the template lacks joints.

@@ -1,7 +1,7 @@
 //! Detection of shoes, and of a skirt or a long coat, from masks.
 //!
-//! Clothes are tried on the posed body, and accepted where they raise the overlap with the masks of several frame sets enough. Poses
-//! stay those of the body; the dressed body is drawn.
+//! Clothes are tried on the posed body, and accepted where they raise the overlap with the masks of several frame sets
+//! enough. Poses stay those of the body; the dressed body is drawn.
 
 use flyrig_body::{Outfit, Part, Shoes, Skirt, Template, skin_mesh};
 use flyrig_types::{Camera, Mask, Pose};
@@ -22,8 +22,8 @@ const FIRST_FLARE: f32 = 0.16;
 const GAIN: f64 = 0.015;
 /// Thicknesses of soles that are tried, metres.
 const SOLES_M: [f32; 5] = [0.008, 0.015, 0.022, 0.03, 0.042];
-/// Least gain in overlap around the feet by which shoes are accepted: thin ones gain up to 0.060 on the bare feet of real footage, and
-/// simulated shoes 0.088 and more where no coat hides them (docs/benchmarks/deform.md).
+/// Least gain in overlap around the feet by which shoes are accepted: thin ones gain up to 0.060 on the bare feet of real
+/// footage, and simulated shoes 0.088 and more where no coat hides them (docs/benchmarks/deform.md).
 const SHOES_GAIN: f64 = 0.065;
 /// Distance around the feet within which masks are compared, metres.
 const AROUND_FEET_M: f64 = 0.05;
@@ -58,7 +58,8 @@ struct Target<'a> {
 }
 
 impl<'a> Target<'a> {
-    /// Reduces a mask to squares of `square_m` metres at the body; `None` when the person is not before the camera or the size differs.
+    /// Reduces a mask to squares of `square_m` metres at the body; `None` when the person is not before the camera or the
+    /// size differs.
     fn new(view: &'a MaskedView<'a>, pose: &Pose, square_m: f64) -> Option<Self> {
         if [view.mask.width(), view.mask.height()] != view.camera.size() {
             return None;
@@ -134,9 +135,9 @@ fn overlap(targets: &[Target<'_>], poses: &[Pose], dressed: Result<Template, fly
     both as f64 / either.max(1) as f64
 }
 
-/// Returns the outfit in which the body covers the masks best, by intersection over union of all views: shoes where they do better than
-/// bare feet, a skirt where it does better than trousers; nothing for a body that cannot wear any. Views of missing poses and masks of
-/// another size than their camera's images are ignored.
+/// Returns the outfit in which the body covers the masks best, by intersection over union of all views: shoes where they do
+/// better than bare feet, a skirt where it does better than trousers; nothing for a body that cannot wear any. Views of
+/// missing poses and masks of another size than their camera's images are ignored.
 #[must_use]
 pub fn find_outfit(body: &Template, seen: &MaskedPoses<'_>) -> Outfit {
     let shoes = find_shoes(body, seen);

@@ -41,8 +41,8 @@ pub(crate) struct ShapeProblem<'a> {
 }
 
 impl ShapeProblem<'_> {
-    /// Returns improved shape and poses, and the standard deviations of the shape's parameters; `None` when the start has no finite
-    /// cost.
+    /// Returns improved shape and poses, and the standard deviations of the shape's parameters; `None` when the start has
+    /// no finite cost.
     pub fn solve(&self, start: &ShapeAndPoses) -> Option<(ShapeAndPoses, Vec<f64>)> {
         let options = Convergence { max_steps: MAX_STEPS, min_gain: 1e-3, ..Convergence::default() };
         let solution = minimize(self, start, &options)?;

@@ -70,8 +70,8 @@ impl PoseEstimator {
         due(&track.inferences, has_image, marks, set.master_nanos, look_after_m, most)
     }
 
-    /// Runs the network after the refinement of a frame set without an inference, in views where outlines and texture have moved the
-    /// body farther than predicted; `None` where they have not, or where the new landmarks do not fit.
+    /// Runs the network after the refinement of a frame set without an inference, in views where outlines and texture have
+    /// moved the body farther than predicted; `None` where they have not, or where the new landmarks do not fit.
     pub(super) fn infer_after_refinement(
         &self,
         set: &FrameSet,
@@ -88,8 +88,8 @@ impl PoseEstimator {
         self.follow(set, pictures, (track, &marks), others, seconds)
     }
 
-    /// Runs the network on crops around the predicted landmarks where it is due, and fits the pose; `None` when the person is no longer
-    /// there.
+    /// Runs the network on crops around the predicted landmarks where it is due, and fits the pose; `None` when the person
+    /// is no longer there.
     fn follow(
         &self,
         set: &FrameSet,

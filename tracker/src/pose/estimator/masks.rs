@@ -1,7 +1,7 @@
 //! Estimation of masks around the fitted body.
 //!
-//! A view's mask joins the network's coarse mask (warped from its last inference), the background and the body's gate; without an
-//! inference that shows the person, it comes from the background and the gate alone.
+//! A view's mask joins the network's coarse mask (warped from its last inference), the background and the body's gate;
+//! without an inference that shows the person, it comes from the background and the gate alone.
 
 use super::*;
 use crate::masks::background_light::MOSTLY_KNOWN;

@@ -25,8 +25,8 @@ impl PosedBody {
 }
 
 impl PoseEstimator {
-    /// Moves the pose so that the body's outline lies on that of the masks and its surface shows the remembered brightness; the
-    /// texture then learns from the images.
+    /// Moves the pose so that the body's outline lies on that of the masks and its surface shows the remembered brightness;
+    /// the texture then learns from the images.
     pub(super) fn refine(
         &self,
         set: &FrameSet,

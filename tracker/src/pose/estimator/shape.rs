@@ -2,8 +2,8 @@
 //!
 //! Bone lengths come from landmarks; lengths, girths and build then from landmarks and outlines, together with the poses
 //! ([`shape_solve`](crate::shape::shape_solve)). A single camera measures only the height, by where the feet stand
-//! ([`single_view`](crate::landmarks::single_view)). Shoes and a skirt are found last ([`outfit_fit`](crate::shape::outfit_fit)):
-//! joints stay those of the body, outlines are those of the feet in shoes.
+//! ([`single_view`](crate::landmarks::single_view)). Shoes and a skirt are found last
+//! ([`outfit_fit`](crate::shape::outfit_fit)): joints stay those of the body, outlines are those of the feet in shoes.
 
 use super::*;
 use crate::pose::line_point::BareBody;
@@ -31,9 +31,10 @@ pub struct ShapeSighting {
 }
 
 impl PoseEstimator {
-    /// Fits the shape to the person in a few frame sets (5 to 10, buffered at the start; motion improves it) and replaces the template by
-    /// the fitted one. The buffered frame sets are then estimated again, in order. `others` holds the landmarks of other people, by
-    /// person and frame set; they are rejected. Also returns the person's own landmarks in each frame set.
+    /// Fits the shape to the person in a few frame sets (5 to 10, buffered at the start; motion improves it) and replaces
+    /// the template by the fitted one. The buffered frame sets are then estimated again, in order. `others` holds the
+    /// landmarks of other people, by person and frame set; they are rejected. Also returns the person's own landmarks in
+    /// each frame set.
     ///
     /// # Errors
     /// Kind `Lost` when too few of the frame sets show a person; the template stays as it was.
@@ -71,10 +72,10 @@ impl PoseEstimator {
         Ok((fit, places))
     }
 
-    /// Fits the shape to a person seen in a few frame sets: bone lengths to the landmarks, then lengths, girths and build to landmarks
-    /// and outlines, together with the poses ([`crate::PoseConfig::shape_rounds`]). A single camera measures only the height: the
-    /// configured one, that of a person who stands on the floor ([`crate::PoseConfig::floor_m`]), or an average one. Does not change the
-    /// estimator; returns the template of the fitted shape for [`Self::take_shape`].
+    /// Fits the shape to a person seen in a few frame sets: bone lengths to the landmarks, then lengths, girths and build
+    /// to landmarks and outlines, together with the poses ([`crate::PoseConfig::shape_rounds`]). A single camera measures
+    /// only the height: the configured one, that of a person who stands on the floor ([`crate::PoseConfig::floor_m`]), or
+    /// an average one. Does not change the estimator; returns the template of the fitted shape for [`Self::take_shape`].
     ///
     /// # Errors
     /// Kind `Lost` when too few of the frame sets show a person in two views.
@@ -122,8 +123,8 @@ impl PoseEstimator {
         turns
     }
 
-    /// Measures the height of a person whose feet stand on the floor, from one camera, metres; `None` for an implausible height, or
-    /// when the camera does not look down on the feet.
+    /// Measures the height of a person whose feet stand on the floor, from one camera, metres; `None` for an implausible
+    /// height, or when the camera does not look down on the feet.
     fn height_on_floor(&self, camera: &Camera, sightings: &[ShapeSighting]) -> Option<f64> {
         let body = |sighting: &ShapeSighting| skin_mesh(&self.surface, &self.model.to_pose(&sighting.fitted.turns)).0;
         let bodies: Vec<Vec<Vec3>> = sightings.iter().map(body).collect();
