@@ -37,7 +37,7 @@ impl Case {
     fn normal_matrix(&self) -> NormalMatrix {
         let mut normal = NormalMatrix::new(NODES, &self.nodes, &self.weights, &self.edges);
         let own: Vec<Carried> = self.matrices.iter().map(|&matrix| Carried { gradient: DVec3::ONE, matrix }).collect();
-        normal.take_in(&own, &mut [DVec3::ZERO; NODES], true);
+        normal.accumulate(&own, &mut [DVec3::ZERO; NODES], true);
         normal
     }
 

@@ -1,4 +1,4 @@
-//! Masks with foreground colours along their outline.
+//! Masks with foreground colours along their outline, which replace those of the image where a person is painted.
 
 use flyrig_types::Mask;
 

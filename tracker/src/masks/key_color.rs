@@ -32,7 +32,7 @@ const SPILL: f32 = 0.3;
 ///
 /// let key: KeyColor = "#00b140".parse()?;
 /// assert_eq!("green".parse::<KeyColor>()?, key);
-/// assert!("grey".parse::<KeyColor>().is_err(), "only saturated colours separate the screen from people");
+/// assert!("#808080".parse::<KeyColor>().is_err(), "grey has no chroma that separates a screen from people");
 /// # Ok::<(), flyrig_tracker::KeyColorError>(())
 /// ```
 #[derive(Debug, Clone, Copy, PartialEq)]

@@ -59,9 +59,9 @@ const LOOKS_EMPTY: f32 = 0.4;
 /// let mask = Mask::new(64, 64, (0..64 * 64).map(|at| 255 * u8::from(wide(at))).collect())?;
 ///
 /// let solved = matte(&image, &mask, None)?;
-/// let before = mask.coverage()[32 * 64 + 18];
-/// let after = solved.mask.coverage()[32 * 64 + 18];
-/// assert!(before == 255 && after < 64, "the wall beside the square is no longer covered: {after}");
+/// // Without a plate the mask keeps half its weight where it disagrees with the colours.
+/// let (before, after) = (mask.coverage()[32 * 64 + 18], solved.mask.coverage()[32 * 64 + 18]);
+/// assert!(before == 255 && after < 160, "the wall beside the square is covered less: {after}");
 /// # Ok::<(), Box<dyn std::error::Error>>(())
 /// ```
 ///
