@@ -3,7 +3,7 @@
 //! The body's pose is known already: it places a crop around each hand and the face in every view where they are large
 //! enough. The landmarks of all views then bend the fingers of the template ([`hand_fit`]) and turn its head
 //! ([`head_fit`]). Inferences are spread over frame sets ([`crop_schedule`]); a hand without a usable one is relaxed, and
-//! the quality says so.
+//! the quality says so. Off by default in a live rig.
 
 mod crop_schedule;
 pub(crate) mod face_net;
