@@ -1,37 +1,39 @@
-//! What can go wrong while tracking.
+//! Errors of tracking.
 
-/// What sort of trouble a [`TrackError`] is.
+/// Kind of a [`TrackError`].
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
 pub enum TrackErrorKind {
-    /// No person was found in this frame set, or too little of one. The estimator searches again on the next set.
+    /// The frame set shows no person, or too little of one. The estimator searches again in the next one.
     Lost,
-    /// The frame set does not fit the rig: wrong number of slots, no frame at all, another image size.
+    /// The frame set does not fit the rig: another number of slots, or no frame at all.
     Frames,
-    /// The pixels are not usable: another size than needed, or a format that cannot be read.
+    /// The image is not usable: another size than expected, or a format that cannot be read.
     Image,
-    /// The network file is damaged or its outputs are not finite.
+    /// The network does not load, or its outputs are missing or not finite.
     Net,
-    /// The template lacks joints that the fit needs, or its numbers are not usable.
+    /// The template lacks joints that the fit needs, or holds unusable numbers.
     Template,
     /// The rig is not valid.
     Rig,
 }
 
-/// Why a pose, a mask or a shape could not be estimated.
+/// Reason why a pose, a mask or a shape could not be estimated.
 #[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
 #[error("{message}")]
 pub struct TrackError {
-    /// What sort of trouble.
+    /// Kind.
     pub kind: TrackErrorKind,
     /// Problem and fix.
     pub message: String,
 }
 
 impl TrackError {
+    /// Creates an error.
     pub(crate) fn new(kind: TrackErrorKind, message: impl Into<String>) -> Self {
         Self { kind, message: message.into() }
     }
 
+    /// Creates an error of kind `Lost`.
     pub(crate) fn lost(message: impl Into<String>) -> Self {
         Self::new(TrackErrorKind::Lost, message)
     }

@@ -6,16 +6,33 @@ use flyrig_types::{Camera, Intrinsics, Isometry, Lens, Mask, Pose, Rig};
 use glam::{DQuat, DVec2, DVec3};
 use rand::{RngExt, SeedableRng, rngs::StdRng};
 
-use crate::body_model::{BodyModel, Turns};
-use crate::fit::{FitProblem, FitView};
-use crate::gate::drawn_body;
-use crate::{Keypoint, LANDMARK_COUNT, ViewKeypoints};
+use crate::landmarks::keypoints::{Keypoint, LANDMARK_COUNT, ViewKeypoints};
+use crate::masks::gate::drawn_body;
+use crate::pose::body_model::{BodyModel, JointTurns};
+use crate::pose::fit::{FitProblem, FitView};
 
 pub(crate) fn body() -> Template {
     default_template(&ShapeParams::default()).unwrap()
 }
 
-/// Cameras on a ring of 3.5 m around the origin, z up, with some distortion.
+/// Returns a pinhole camera of square images at the world's origin, focal length 90 pixels.
+pub(crate) fn small_camera(id: &str, side: usize) -> Camera {
+    Camera {
+        time_offset_nanos: 0,
+        color: Default::default(),
+        id: id.into(),
+        intrinsics: Intrinsics {
+            width: side as u32,
+            height: side as u32,
+            focal_px: DVec2::splat(90.0),
+            center_px: DVec2::splat(0.5 * side as f64 - 0.5),
+            lens: Lens::PINHOLE,
+        },
+        camera_from_world: Isometry::IDENTITY,
+    }
+}
+
+/// Returns cameras on a ring of 3.5 m around the origin, z up, with some distortion.
 pub(crate) fn ring(count: usize) -> Rig {
     let cameras = (0..count)
         .map(|i| {
@@ -46,19 +63,19 @@ pub(crate) fn keypoints_of(camera: &Camera, points: &[DVec3; LANDMARK_COUNT]) ->
     })
 }
 
-/// A fit to landmarks alone, without a pose before.
+/// Returns a fit to landmarks alone, without a last pose.
 pub(crate) fn fit_problem<'a>(model: &'a BodyModel, views: &'a [FitView], landmark_spread: f64) -> FitProblem<'a> {
     FitProblem { model, views, lines: &[], points: [None; LANDMARK_COUNT], before: None, landmark_spread, robust: 2.0 }
 }
 
-/// The mask of a posed body.
+/// Returns the mask of a posed body.
 pub(crate) fn mask_of(camera: &Camera, template: &Template, pose: &Pose) -> Mask {
     let (vertices, _) = skin_mesh(template, pose);
     let ([x0, y0, ..], body) = drawn_body(camera, &vertices, &template.triangles, 4.0).unwrap();
     body.paste(camera.intrinsics.width as usize, camera.intrinsics.height as usize, x0, y0).unwrap()
 }
 
-/// The same with Gaussian-like noise in pixels.
+/// Returns [`keypoints_of`] with uniform noise of about `noise_px` standard deviation.
 pub(crate) fn noisy_keypoints(
     camera: &Camera,
     points: &[DVec3; LANDMARK_COUNT],
@@ -72,8 +89,8 @@ pub(crate) fn noisy_keypoints(
     })
 }
 
-/// A body that stands near the origin of a z-up world in a comfortable pose.
-pub(crate) fn random_turns(model: &BodyModel, seed: u64) -> Turns {
+/// Returns a body that stands near the origin of a z-up world in a comfortable pose.
+pub(crate) fn random_turns(model: &BodyModel, seed: u64) -> JointTurns {
     let mut rng = StdRng::seed_from_u64(seed);
     let mut turns = model.bind_turns(DVec3::new(rng.random_range(-0.2..0.2), rng.random_range(-0.2..0.2), 1.0));
     for (turn, range) in turns.turns.iter_mut().zip(&model.ranges) {

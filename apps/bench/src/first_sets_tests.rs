@@ -44,7 +44,7 @@ fn every_view_is_looked_at_until_the_motion_is_known() {
         estimator.estimate(&set(&mut simulator, index, nanos)).unwrap()
     };
     let start = (first.unwrap() as i64) * STEP_NANOS;
-    assert_eq!(next(&mut estimator, start + STEP_NANOS).quality.looked, 3, "the speed is not known");
+    assert_eq!(next(&mut estimator, start + STEP_NANOS).quality.inferred, 3, "the speed is not known");
     // From now on only where the body is predicted to have moved: not within a millisecond.
-    assert_eq!(next(&mut estimator, start + STEP_NANOS + 1_000_000).quality.looked, 0);
+    assert_eq!(next(&mut estimator, start + STEP_NANOS + 1_000_000).quality.inferred, 0);
 }

@@ -1,13 +1,13 @@
 //! `flyrig-bench landmarks`: bias and spread of the landmark network on people whose pose is known.
 //!
-//! The result is the table in `tracker/src/habits.rs`.
+//! The result is the table in `tracker/src/landmarks/bias.rs`.
 
 use anyhow::{Context, Result};
 use flyrig_body::load_gltf;
 use flyrig_capture::{FolderOptions, FolderReplay};
 use flyrig_fusion::next_frame;
 use flyrig_report::{dataset, progress_bar};
-use flyrig_tracker::{Doubt, LANDMARK_NAMES, LandmarkStudy, PoseNet};
+use flyrig_tracker::{ConfidenceSpread, LANDMARK_NAMES, LandmarkStudy, PoseNet};
 
 use crate::cli::BenchLandmarksArgs;
 
@@ -36,13 +36,13 @@ pub fn landmarks(args: &BenchLandmarksArgs) -> Result<()> {
         bar.finish_and_clear();
     }
     println!("{:>3} {:<20} {:>7} {:>7} {:>7} {:>8} {:>6}", "", "landmark", "x mm", "y mm", "z mm", "spread", "seen");
-    for habit in study.habits() {
-        let [x, y, z] = (habit.bias_m * 1e3).to_array();
-        let (name, spread) = (LANDMARK_NAMES[habit.landmark], habit.spread_m * 1e3);
-        println!("{:>3} {name:<20} {x:>7.1} {y:>7.1} {z:>7.1} {spread:>8.1} {:>6}", habit.landmark, habit.count);
+    for bias in study.biases() {
+        let [x, y, z] = (bias.bias_m * 1e3).to_array();
+        let (name, spread) = (LANDMARK_NAMES[bias.landmark], bias.spread_m * 1e3);
+        println!("{:>3} {name:<20} {x:>7.1} {y:>7.1} {z:>7.1} {spread:>8.1} {:>6}", bias.landmark, bias.count);
     }
     println!("\nspread of less certain landmarks, as a multiple of the above");
-    for Doubt { up_to, times, count } in study.doubts() {
+    for ConfidenceSpread { up_to, times, count } in study.spreads() {
         println!("confidence up to {up_to:.2} {times:>6.2} {count:>6}");
     }
     Ok(())

@@ -29,7 +29,7 @@ pub fn masks(args: &BenchMasksArgs) -> Result<()> {
         let bar = progress_bar(count, format!("masks of {}", camera.id));
         let mut found = 0;
         while let Some(set) = sets.next_set()? {
-            let masks = viewers.look(&set)?.into_iter().flatten().flat_map(|estimate| estimate.masks).flatten();
+            let masks = viewers.estimate(&set)?.into_iter().flatten().flat_map(|estimate| estimate.masks).flatten();
             for mask in masks {
                 let file = folder.join(format!("{:06}.png", frame_number(&set)));
                 write_whole(&file, &png::encode_mask(&mask)?)?;

@@ -35,7 +35,7 @@ impl Silhouettes {
         if unknown.present().next().is_none() {
             return Ok(());
         }
-        let found = self.viewers.look(&unknown)?;
+        let found = self.viewers.estimate(&unknown)?;
         for ((track, frame), found) in self.tracks.iter_mut().zip(&unknown.frames).zip(found) {
             if let (Some(frame), Some(found)) = (frame, found) {
                 found.masks.iter().flatten().for_each(|mask| track.add(frame.capture_nanos, mask));

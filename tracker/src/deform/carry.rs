@@ -1,12 +1,12 @@
-//! From derivatives by world centres to derivatives by canonical displacements.
+//! Derivatives by canonical displacements from derivatives by world centres, through each Gaussian's blended bone matrix.
 
 use flyrig_body::{SkinWeights, skin_jacobian_f64};
 use glam::{DMat3, DVec3};
 use rayon::prelude::*;
 
-use super::PointDerivatives;
+use crate::deform::data::PointDerivatives;
 
-/// Of one Gaussian.
+/// Derivatives of one Gaussian.
 #[derive(Debug, Clone, Copy)]
 pub(super) struct Carried {
     /// dL/d t_x, per metre.
@@ -15,12 +15,12 @@ pub(super) struct Carried {
     pub matrix: DMat3,
 }
 
-/// With B the blended bone matrix of a Gaussian (d LBS(x + t_x) / d t_x): `B^T g` and `B^T H B`, zero for Gaussians that are not
-/// seen; and how many were left out because a number was not finite.
+/// Returns `B^T g` and `B^T H B` of each Gaussian, with B its blended bone matrix (d LBS(x + t_x) / d t_x), zero for unseen
+/// ones; and the number of Gaussians that were dropped because a number was not finite.
 pub(super) fn to_canonical(derivatives: &PointDerivatives, skin: &[SkinWeights]) -> (Vec<Carried>, usize) {
     let one = |g: usize| -> Result<Carried, ()> {
         let gradient = derivatives.gradient.get(g).copied().unwrap_or_default();
-        // NaN counts as seen, and falls below.
+        // NaN counts as seen, and is dropped below.
         if gradient[3] <= 0.0 {
             return Ok(UNSEEN);
         }
@@ -44,7 +44,7 @@ pub(super) fn to_canonical(derivatives: &PointDerivatives, skin: &[SkinWeights])
     (all.into_iter().map(|one| one.unwrap_or(UNSEEN)).collect(), dropped)
 }
 
-/// A Gaussian that is not seen.
+/// Derivatives of an unseen Gaussian.
 const UNSEEN: Carried = Carried { gradient: DVec3::ZERO, matrix: DMat3::ZERO };
-/// Gaussians that one task carries.
+/// Gaussians per parallel task.
 const GAUSSIANS_A_TASK: usize = 1024;

@@ -1,22 +1,22 @@
-//! The normal equations of the graph: symmetric 3x3 blocks for pairs of nodes, solved by conjugate gradients.
+//! Normal equations of the graph: symmetric 3x3 blocks for pairs of nodes, solved by preconditioned conjugate gradients.
 
 use glam::{DMat3, DVec3};
 use rayon::prelude::*;
 
-use super::carry::Carried;
+use crate::deform::carry::Carried;
 
-/// Entry of a list of pairs that stands for none.
+/// Marks a missing pair.
 const NONE: u32 = u32::MAX;
-/// Conjugate gradients end at this share of the first residual, or after so many iterations. The step is tested on the
-/// images anyway: 1e-4 lowers the loss no further and takes twice as long.
+/// Share of the first residual at which conjugate gradients end, and their largest number of iterations. The step is tested
+/// on the images anyway: 1e-4 lowers the loss no further and takes twice as long.
 const TOLERANCE: f64 = 1e-3;
 const MAX_ITERATIONS: usize = 200;
-/// Rows that one task of a product takes.
+/// Rows per parallel task of a product.
 const ROWS_A_TASK: usize = 128;
-/// Nodes or pairs whose Gaussians one task adds up.
+/// Nodes or pairs per parallel task of a sum.
 const SUMS_A_TASK: usize = 64;
 
-/// For each node or pair of nodes its Gaussians in their order, and the weight that each counts with.
+/// Gaussians of each node or pair of nodes, in their order, with their weights.
 #[derive(Debug)]
 struct Shares {
     ends: Vec<usize>,
@@ -24,7 +24,7 @@ struct Shares {
 }
 
 impl Shares {
-    /// Of `(node or pair, Gaussian, weight)`, ordered by Gaussian.
+    /// Groups `(node or pair, Gaussian, weight)`, ordered by Gaussian, by node or pair.
     fn new(count: usize, all: &[(u32, u32, f64)]) -> Self {
         let mut ends = vec![0; count];
         for &(of, ..) in all {
@@ -43,22 +43,23 @@ impl Shares {
         Self { ends, shares }
     }
 
+    /// Returns Gaussians and weights of a node or pair.
     fn of(&self, index: usize) -> &[(u32, f64)] {
         let begin = if index > 0 { self.ends[index - 1] } else { 0 };
         &self.shares[begin..self.ends[index]]
     }
 }
 
-/// `H + stiffness * L` with a sparsity that never changes: nodes that share a Gaussian or an edge.
+/// Matrix `H + stiffness * L` with a fixed sparsity: pairs of nodes that share a Gaussian or an edge.
 #[derive(Debug)]
 pub(super) struct NormalMatrix {
-    /// Weights of the Gaussians that hang on each node, and products of their weights for each pair.
+    /// Weights of the Gaussians attached to each node, and products of their weights for each pair.
     of_node: Shares,
     of_pair: Shares,
-    /// Row by row: the other node and the pair's number; `rows[n]..rows[n + 1]` is node n's.
+    /// Other node and pair of each entry, row by row; `rows[n]..rows[n + 1]` is the row of node n.
     rows: Vec<usize>,
     others: Vec<(u32, u32)>,
-    /// Stiffness of the edges a pair, and a node.
+    /// Sums of the edges' stiffness per pair, and per node.
     pair_edges: Vec<f64>,
     node_edges: Vec<f64>,
     diagonal: Vec<DMat3>,
@@ -68,6 +69,7 @@ pub(super) struct NormalMatrix {
 const CORNERS: [(usize, usize); 6] = [(0, 1), (0, 2), (0, 3), (1, 2), (1, 3), (2, 3)];
 
 impl NormalMatrix {
+    /// Builds the sparsity; `edges` are directed, with their stiffness.
     pub(super) fn new(
         nodes: usize,
         gaussian_nodes: &[[u32; 4]],
@@ -79,7 +81,7 @@ impl NormalMatrix {
             let (n, m) = (gaussian_nodes[g][a], gaussian_nodes[g][b]);
             (n != m && weights[g][a] > 0.0 && weights[g][b] > 0.0).then(|| ordered(n, m))
         };
-        // Two different nodes each, the smaller first, ascending.
+        // Pairs of different nodes, the smaller first, ascending.
         let mut pairs: Vec<(u32, u32)> = edges.iter().map(|&(a, b, _)| ordered(a, b)).collect();
         pairs.extend((0..gaussian_nodes.len()).flat_map(|g| CORNERS.iter().filter_map(move |&c| of_gaussian(g, c))));
         pairs.sort_unstable();
@@ -121,14 +123,15 @@ impl NormalMatrix {
         Self { of_node, of_pair, rows, others, pair_edges, node_edges, diagonal, off_diagonal }
     }
 
+    /// Sets H to zero.
     pub(super) fn clear(&mut self) {
         self.diagonal.fill(DMat3::ZERO);
         self.off_diagonal.fill(DMat3::ZERO);
     }
 
-    /// Adds the gradients of the Gaussians' own displacements to those of their nodes, and where asked their matrices. Each sum is
-    /// made in the order of the Gaussians: equal input gives equal bytes for any number of threads.
-    pub(super) fn take_in(&mut self, own: &[Carried], gradient: &mut [DVec3], with_matrix: bool) {
+    /// Adds the derivatives by the Gaussians' displacements to `gradient` by the nodes, and with `with_matrix` to H. Each
+    /// sum runs in the order of the Gaussians: equal input gives equal bytes for any number of threads.
+    pub(super) fn accumulate(&mut self, own: &[Carried], gradient: &mut [DVec3], with_matrix: bool) {
         let Self { of_node, of_pair, diagonal, off_diagonal, .. } = self;
         let nodes = gradient.par_iter_mut().zip(diagonal).enumerate().with_min_len(SUMS_A_TASK);
         nodes.for_each(|(n, (gradient, diagonal))| {
@@ -150,35 +153,35 @@ impl NormalMatrix {
         }
     }
 
-    /// The data's own block of a node.
+    /// Returns the diagonal block of H of a node.
     pub(super) fn diagonal_block(&self, node: usize) -> DMat3 {
         self.diagonal[node]
     }
 
-    /// Mean stiffness of a node's edges: the mean diagonal of L.
+    /// Returns the mean diagonal of L: the mean stiffness of a node's edges.
     pub(super) fn mean_edges(&self) -> f64 {
         self.node_edges.iter().sum::<f64>() / self.node_edges.len().max(1) as f64
     }
 
-    /// Mean of the diagonal's entries, those of H alone.
+    /// Returns the mean diagonal entry of H.
     pub(super) fn mean_diagonal(&self) -> f64 {
         let sum: f64 = self.diagonal.iter().map(|m| m.x_axis.x + m.y_axis.y + m.z_axis.z).sum();
         sum / (3 * self.diagonal.len().max(1)) as f64
     }
 
-    /// `H x`, node by node; the blocks are symmetric.
+    /// Returns the row of node `n` of `H x`; the blocks are symmetric.
     fn times_data(&self, x: &[DVec3], n: usize) -> DVec3 {
         let others = &self.others[self.rows[n]..self.rows[n + 1]];
         others.iter().fold(self.diagonal[n] * x[n], |sum, &(m, k)| sum + self.off_diagonal[k as usize] * x[m as usize])
     }
 
-    /// `L x`, node by node.
+    /// Returns the row of node `n` of `L x`.
     fn times_laplacian(&self, x: &[DVec3], n: usize) -> DVec3 {
         let others = &self.others[self.rows[n]..self.rows[n + 1]];
         others.iter().fold(x[n] * self.node_edges[n], |sum, &(m, k)| sum - x[m as usize] * self.pair_edges[k as usize])
     }
 
-    /// Solves `(H + stiffness L + damping) x = right`; `damping` above 0 keeps it regular whatever H and L are.
+    /// Solves `(H + stiffness L + damping) x = right`; `damping` above 0 keeps it regular for any H and L.
     pub(super) fn solve(&self, stiffness: f64, damping: f64, right: &[DVec3]) -> Vec<DVec3> {
         let nodes = self.diagonal.len();
         let own =
@@ -192,7 +195,7 @@ impl NormalMatrix {
     }
 }
 
-/// Preconditioned conjugate gradients for a symmetric positive definite matrix.
+/// Solves a symmetric positive definite system by preconditioned conjugate gradients.
 fn conjugate_gradients(
     right: &[DVec3],
     times: impl Fn(&[DVec3]) -> Vec<DVec3>,
@@ -227,7 +230,7 @@ fn conjugate_gradients(
     x
 }
 
-/// Inverse of a positive definite block; of one that rounding made singular, the inverse of its mean diagonal.
+/// Returns the inverse of a positive definite block, or of its mean diagonal where rounding made it singular.
 fn inverse(m: DMat3) -> DMat3 {
     let inverse = m.inverse();
     let mean = (m.x_axis.x + m.y_axis.y + m.z_axis.z) / 3.0;

@@ -1,4 +1,4 @@
-//! Matrices on the edge of what can be solved.
+//! Tests of the normal equations on nearly singular matrices.
 
 use glam::{DQuat, DVec3};
 use nalgebra::{DMatrix, DVector};
@@ -9,7 +9,7 @@ use super::*;
 
 const NODES: usize = 14;
 
-/// Gaussians that hang on nodes in a row; the last node has neither Gaussian nor neighbour.
+/// Gaussians attached to nodes in a row; the last node has neither Gaussian nor neighbour.
 struct Case {
     nodes: Vec<[u32; 4]>,
     weights: Vec<[f32; 4]>,
@@ -37,11 +37,11 @@ impl Case {
     fn normal_matrix(&self) -> NormalMatrix {
         let mut normal = NormalMatrix::new(NODES, &self.nodes, &self.weights, &self.edges);
         let own: Vec<Carried> = self.matrices.iter().map(|&matrix| Carried { gradient: DVec3::ONE, matrix }).collect();
-        normal.take_in(&own, &mut [DVec3::ZERO; NODES], true);
+        normal.accumulate(&own, &mut [DVec3::ZERO; NODES], true);
         normal
     }
 
-    /// `x^T (H + stiffness L + damping) y`, straight from the definitions.
+    /// Returns `x^T (H + stiffness L + damping) y` from the definitions.
     fn product(&self, x: &[DVec3], y: &[DVec3]) -> f64 {
         let mut sum = 0.0;
         for ((nodes, weights), matrix) in self.nodes.iter().zip(&self.weights).zip(&self.matrices) {
@@ -55,12 +55,12 @@ impl Case {
         sum + (0..NODES).map(|n| self.damping * x[n].dot(y[n])).sum::<f64>()
     }
 
-    /// Of the quadratic model `x^T A x / 2 - b^T x`, which starts at 0.
+    /// Returns the value of the quadratic model `x^T A x / 2 - b^T x`, which starts at 0.
     fn model(&self, x: &[DVec3], right: &[DVec3]) -> f64 {
         0.5 * self.product(x, x) - x.iter().zip(right).map(|(x, b)| x.dot(*b)).sum::<f64>()
     }
 
-    /// The lowest the model can go.
+    /// Returns the minimum of the model.
     fn lowest(&self, right: &[DVec3]) -> f64 {
         let unit = |k: usize| {
             let mut v = vec![DVec3::ZERO; NODES];
@@ -83,7 +83,7 @@ fn turned(rng: &mut StdRng, diagonal: [f64; 3]) -> DMat3 {
     (matrix + matrix.transpose()) * 0.5
 }
 
-/// Nothing pulls at the last node.
+/// The last node has no gradient.
 fn random_right(rng: &mut StdRng, len: usize, size: f64) -> Vec<DVec3> {
     let mut right: Vec<DVec3> =
         (0..len).map(|_| DVec3::from([(); 3].map(|()| rng.random_range(-1.0..1.0))) * size).collect();

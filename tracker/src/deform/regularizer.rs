@@ -1,26 +1,26 @@
-//! Spatial and temporal smoothness, FlyHuman Eq. 4.
+//! Spatial and temporal smoothness (FlyHuman Eq. 4), and the anchor.
 
 use glam::DVec3;
 
-use super::thickness::Thickness;
+use crate::deform::thickness::Thickness;
 
-/// Eq. 4 over the directed edges of the graph, times λ_reg.
+/// Terms of Eq. 4 over the directed edges of the graph, times λ_reg.
 #[derive(Debug)]
 pub(super) struct Regularizer {
-    /// Directed edges (node, neighbour) and how stiff each is; a node without neighbours has none.
+    /// Directed edges (node, neighbour) with their stiffness; a node without neighbours has none.
     pub edges: Vec<(u32, u32, f64)>,
     /// λ_reg λ_spat.
     pub spatial: f64,
     /// λ_reg λ_temp.
     pub temporal: f64,
-    /// Price of every node's distance from where its pose puts it.
+    /// Weight of every node's squared distance from the place of its pose.
     pub anchor: f64,
-    /// Whether there were frames before this one; the temporal term is off without.
+    /// Whether there were frame sets before this one; the temporal term is off without.
     pub history: bool,
 }
 
 impl Regularizer {
-    /// Weight of the Laplacian's edges in the second derivative, times the identity.
+    /// Returns the factor of the graph Laplacian in the second derivative.
     pub(super) fn stiffness(&self) -> f64 {
         2.0 * (self.spatial + self.temporal())
     }
@@ -29,8 +29,8 @@ impl Regularizer {
         if self.history { self.temporal } else { 0.0 }
     }
 
-    /// The loss at translations `t` with smoothed translations `smooth`; adds the gradient where asked. Spatial smoothness
-    /// and the anchor count from `thickness`.
+    /// Returns the loss at translations `t` with smoothed translations `smooth`, and adds its gradient to `gradient`.
+    /// Spatial smoothness and the anchor are measured from `thickness`.
     pub(super) fn loss(
         &self,
         t: &[DVec3],

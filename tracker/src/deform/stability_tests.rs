@@ -1,11 +1,11 @@
-//! Long runs and hard matrices. What takes minutes is ignored by default: `make test-long`.
+//! Tests of long runs and hard matrices. Those that take minutes are ignored by default: `make test-long`.
 
 use super::tests::{Goals, body, goals, tracker, true_displacement, wide};
 use super::*;
 use glam::{DMat3, DQuat};
 use std::convert::Infallible;
 
-/// Mean distance of the seen Gaussians to where the clothes are at a time.
+/// Returns the mean distance of the seen Gaussians from the true clothes, early and late in a run.
 fn drift(frames: usize) -> (f64, f64) {
     let body = body(500, 30);
     let mut data = goals(&body);
@@ -48,11 +48,11 @@ fn ten_thousand_frames_do_not_drift() {
     assert!(late <= 1.1 * early);
 }
 
-/// Matrices that say something along one direction only, or nearly nothing, or far too much.
+/// Matrices that constrain one direction only, or hardly any, or far too strongly.
 struct Flat<'a> {
     inner: Goals<'a>,
     keep: [f64; 3],
-    /// Of the directions, by Gaussian.
+    /// Rotation of the constrained directions from Gaussian to Gaussian, radians.
     turn: f64,
 }
 
@@ -122,7 +122,8 @@ fn a_frame_without_anything_to_gain_gets_no_iteration_until_something_moves() {
     assert!((0..40).all(|_| !never.track(&mut goals(&body)).unwrap().at_rest), "the switch");
 }
 
-/// The person, the cameras and all that has a unit of length times `unit`; weights are units of loss a square metre.
+/// Scales the person, the cameras and everything with a unit of length by `unit`; weights are units of loss per square
+/// metre.
 fn solved_in(unit: f64) -> (Vec<DVec3>, Vec<f64>) {
     let mut body = body(2_000, 60);
     body.surface.positions.iter_mut().for_each(|x| *x *= unit as f32);

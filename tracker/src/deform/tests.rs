@@ -1,4 +1,4 @@
-//! The solver on data whose answer is known: world points that each visible Gaussian should reach.
+//! Tests of the solver on data with a known solution: world points that each visible Gaussian should reach.
 
 use std::convert::Infallible;
 
@@ -14,14 +14,14 @@ use rand::{RngExt, SeedableRng};
 
 use super::*;
 
-/// Squared distance, times `weight`, of every Gaussian to its goal in the world.
+/// Data term: squared distance of every Gaussian from its goal in the world, times `weight`.
 pub(super) struct Goals<'a> {
     pub(super) positions: &'a [Vec3],
     pub(super) skin: &'a [SkinWeights],
     pub(super) bones: &'a [DMat4],
     pub(super) goals: Vec<DVec3>,
     pub(super) weights: Vec<f64>,
-    /// Turns the gradient round, to see whether a step uphill is refused.
+    /// Reverses the gradient, to test whether a step uphill is refused.
     pub(super) sign: f32,
     pub(super) calls: usize,
 }
@@ -79,13 +79,13 @@ pub(super) fn body(gaussians: usize, nodes: usize) -> Body {
     Body { template, surface, graph, bones }
 }
 
-/// What the clothes do: up to 3 cm, smooth.
+/// Returns the true displacement of the clothes: up to 3 cm, smooth.
 pub(super) fn true_displacement(x: Vec3) -> DVec3 {
     let x = x.as_dvec3() * 7.0;
     0.015 * DVec3::new(x.y.sin() + x.z.cos(), (x.x + x.z).sin(), x.y.cos() + (x.x * 1.3).sin())
 }
 
-/// Goals for the Gaussians in front (z > 0), as one camera sees them.
+/// Returns goals for the Gaussians in front (z > 0), as one camera sees them.
 pub(super) fn goals(body: &Body) -> Goals<'_> {
     let Body { surface, bones, .. } = body;
     let goal = |g: usize| {
@@ -107,7 +107,7 @@ pub(super) fn tracker(body: &Body, settings: DeformSettings) -> DeformTracker {
     DeformTracker::new(&body.graph, &body.surface.skin, settings).unwrap()
 }
 
-/// Knows normals and parts, too.
+/// Returns a tracker that knows normals and parts.
 fn clothed(body: &Body, settings: DeformSettings) -> DeformTracker {
     let surface = &body.surface;
     let of_node = |&g: &u32| (surface.normals[g as usize].as_dvec3(), surface.parts[g as usize] as usize);
@@ -115,12 +115,12 @@ fn clothed(body: &Body, settings: DeformSettings) -> DeformTracker {
     tracker(body, settings).with_thickness(normals, parts).unwrap()
 }
 
-/// Total loss at these translations, straight from the equations.
+/// Returns the total loss at translations, from the equations.
 fn total_loss(body: &Body, data: &Goals<'_>, settings: &DeformSettings, t: &[DVec3], smooth: &[DVec3]) -> f64 {
     clothed_loss(body, data, settings, t, smooth, &vec![(DVec3::ZERO, 1.0); t.len()])
 }
 
-/// The same, with smoothness and anchor that count from each node's offset, and its stiffness.
+/// Returns the total loss with smoothness and anchor measured from each node's offset, and its stiffness.
 fn clothed_loss(
     body: &Body,
     data: &Goals<'_>,
@@ -223,7 +223,7 @@ fn gradient_and_matrix_match_differences_and_a_dense_solve() {
     assert!(error < 5e-3, "{error}");
 }
 
-/// Losses of one frame, the one after its last step included, and its time in milliseconds.
+/// Returns the losses of one frame set, including that after its last step, and its time in milliseconds.
 fn first_frame(body: &Body, settings: DeformSettings) -> (DeformReport, f64) {
     let mut data = goals(body);
     let mut tracker = tracker(body, settings);
@@ -307,7 +307,7 @@ fn a_step_that_does_not_lower_the_loss_is_undone() {
 
 type Spoil = fn(&mut PointDerivatives);
 
-/// Derivatives that went wrong on the way.
+/// Data term with corrupted derivatives.
 struct Poisoned<'a> {
     inner: Goals<'a>,
     loss: Option<f64>,
@@ -415,7 +415,7 @@ fn what_does_not_fit_is_refused() {
 }
 
 #[test]
-fn where_nobody_looks_clothes_are_as_thick_as_where_somebody_does() {
+fn unseen_clothes_are_as_thick_as_seen_ones() {
     let body = body(8000, 800);
     let mut data = goals(&body);
     // Two centimetres of clothes all over.
@@ -440,7 +440,7 @@ fn where_nobody_looks_clothes_are_as_thick_as_where_somebody_does() {
     // Another person: forgotten.
     with_thickness.reset();
     assert_eq!(with_thickness.thickness.as_ref().unwrap().offset(0), DVec3::ZERO);
-    // A frame nobody sees teaches nothing, and lists that do not fit are told.
+    // An unseen frame set changes nothing, and lists that do not fit are errors.
     data.weights.fill(0.0);
     with_thickness.track(&mut data).unwrap();
     assert_eq!(with_thickness.thickness.as_ref().unwrap().offset(0), DVec3::ZERO);

@@ -1,44 +1,45 @@
-//! How thick the clothes are, part by part: where nobody looks, they are as thick as where somebody does.
+//! Thickness of clothes per body part: where no camera looks, they are as thick as on the seen part of the same limb.
 
 use glam::DVec3;
 
-use super::normal::NormalMatrix;
+use crate::deform::normal::NormalMatrix;
 
-/// A part that is seen less than this share of what all parts are together is believed to be like the others.
+/// Weight of the mean thickness of all parts, as a share of all weights: a part that is hardly seen resembles the others.
 const LEAST_SHARE: f64 = 0.01;
-/// Share of a frame in what is known, once something is.
+/// Share of a frame set in the known thickness, after the first.
 const RATE: f64 = 0.5;
 
-/// The mean displacement of each part along its normals, where the images tell it. Smoothness (Eq. 4) then counts from
+/// Mean displacement of each part along its normals, where the images constrain it. Smoothness (Eq. 4) is measured from
 /// there, so that the unseen side of a sleeve is not dragged along by the seen one but follows it outwards.
 #[derive(Debug)]
 pub(super) struct Thickness {
     /// Canonical normals of the nodes, and their parts.
     normals: Vec<DVec3>,
     parts: Vec<usize>,
-    /// Thinnest and thickest, metres.
+    /// Plausible range, metres.
     range_m: [f64; 2],
-    /// Metres a part; none before the first frame.
+    /// Thickness of each part, metres; `None` before the first frame set.
     known: Option<Vec<f64>>,
 }
 
 impl Thickness {
-    /// One normal and one part a node.
+    /// Creates an unknown thickness from one normal and one part per node.
     pub(super) fn new(normals: Vec<DVec3>, parts: Vec<usize>, range_m: [f64; 2]) -> Self {
         Self { normals, parts, range_m, known: None }
     }
 
+    /// Forgets the thickness.
     pub(super) fn forget(&mut self) {
         self.known = None;
     }
 
-    /// Where the node would be if it were clothed like its part, canonical metres.
+    /// Returns the displacement of a node clothed like its part, canonical metres.
     pub(super) fn offset(&self, node: usize) -> DVec3 {
         let Some(known) = &self.known else { return DVec3::ZERO };
         self.normals[node] * known[self.parts[node]]
     }
 
-    /// Learns from a frame's result: what the images say along the normals, `n^T H n`, is a node's weight.
+    /// Learns from the result of a frame set; a node's weight is the information of the images along its normal, `n^T H n`.
     pub(super) fn learn(&mut self, translations: &[DVec3], matrix: &NormalMatrix) {
         let count = self.parts.iter().max().map_or(0, |most| most + 1);
         let mut sums = vec![(0.0, 0.0); count];

@@ -1,49 +1,49 @@
-//! The deformation from frame to frame.
+//! Tracking of the deformation from frame set to frame set: steps, damping, limits and the loss's floor.
 
 use flyrig_body::{DeformationGraph, SkinWeights, displacement};
 use glam::{DVec3, Vec3};
 use rayon::prelude::*;
 
-use super::carry::to_canonical;
-use super::normal::NormalMatrix;
-use super::regularizer::Regularizer;
-use super::settings::FIRST_FRAMES;
-use super::thickness::Thickness;
-use super::{DataTerm, DeformSettings, DeformSolver, PointDerivatives};
-use crate::{TrackError, TrackErrorKind};
+use crate::deform::carry::to_canonical;
+use crate::deform::data::{DataTerm, PointDerivatives};
+use crate::deform::normal::NormalMatrix;
+use crate::deform::regularizer::Regularizer;
+use crate::deform::settings::{DeformSettings, DeformSolver, FIRST_FRAMES};
+use crate::deform::thickness::Thickness;
+use crate::error::{TrackError, TrackErrorKind};
 
-/// Damping never falls below or rises above these shares of the mean diagonal.
+/// Limits of the damping, shares of the mean diagonal.
 const DAMPING_RANGE: (f64, f64) = (1e-3, 1e6);
-/// Shares of the predicted fall of the loss above and below which the damping changes after a step.
+/// Ratios of actual to predicted decrease of the loss above and below which the damping changes after a step.
 const GOOD_GAIN: f64 = 0.75;
 const POOR_GAIN: f64 = 0.25;
-/// A step is not tried when it promises to lower the loss by less than this share: the images' sums are `f32`, and what
-/// rounding says of so small a step would decide on the damping of the next frames.
+/// Least predicted decrease of the loss, as a share of it, for a step to be tried: the images' sums are `f32`, and rounding
+/// would otherwise decide on the damping of the next frame sets.
 const LEAST_GAIN: f64 = 1e-5;
-/// Keeps the matrix regular where neither image nor neighbour says anything, as a share of its mean diagonal: the unit
-/// of length does not matter.
+/// Damping that keeps the matrix regular where neither image nor neighbour constrains a node, as a share of its mean
+/// diagonal, so that the unit of length does not matter.
 const LEAST_DAMPING: f64 = 1e-11;
 
-/// What one frame did to the deformation.
+/// Report of the solver on one frame set.
 #[derive(Debug, Clone, PartialEq, Default)]
 pub struct DeformReport {
-    /// Total loss (Eq. 3) before the first iteration and after each one that was made; of [`DeformSolver::Paper`], which
-    /// never looks where it stepped to, before each one.
+    /// Total loss (Eq. 3) before the first iteration and after each one; for [`DeformSolver::Paper`], which does not
+    /// evaluate its steps, before each one.
     pub losses: Vec<f64>,
-    /// Steps that were taken.
+    /// Accepted steps.
     pub accepted: usize,
-    /// Steps that were refused because the loss did not fall.
+    /// Steps that were rejected because the loss did not fall.
     pub refused: usize,
-    /// Gaussians left out because a derivative was not finite.
+    /// Gaussians that were dropped because a derivative was not finite.
     pub dropped: usize,
-    /// The loss was not finite: all is as it was before the frame.
+    /// Whether the loss was not finite, so that the frame set changed nothing.
     pub poisoned: bool,
-    /// The loss was at its floor: no iteration was made.
+    /// Whether the loss was at its floor, so that no iteration was made.
     pub at_rest: bool,
 }
 
-/// Translations of the graph's nodes, tracked over time. State that is not finite never comes in: a frame whose loss is
-/// not finite leaves everything as it was.
+/// Translations of the graph's nodes, tracked over time. The state stays finite: a frame set whose loss is not finite
+/// changes nothing.
 #[derive(Debug)]
 pub struct DeformTracker {
     settings: DeformSettings,
@@ -59,13 +59,13 @@ pub struct DeformTracker {
     derivatives: Vec<PointDerivatives>,
     thickness: Option<Thickness>,
     damping: f64,
-    /// Loss below which there is nothing left to gain.
+    /// Loss at which the last iteration gained almost nothing.
     floor: Option<f64>,
     frame: u64,
 }
 
 impl DeformTracker {
-    /// At rest. `skin` holds the weights of the Gaussians that `graph` was built for.
+    /// Creates a tracker at rest. `skin` holds the weights of the Gaussians that `graph` was built for.
     ///
     /// # Errors
     /// [`TrackErrorKind::Template`] when graph and skin do not fit together or the settings are not usable.
@@ -119,11 +119,11 @@ impl DeformTracker {
         })
     }
 
-    /// Makes parts of the body stiffer: an edge's share of Eq. 4 counts as many times as the geometric mean of its two
-    /// nodes' numbers. Gradient descent knows nothing of it.
+    /// Scales the stiffness of parts of the body (head, hands and feet are stiffer than clothes): an edge's share of Eq. 4
+    /// is multiplied by the geometric mean of its two nodes' numbers. Gradient descent ignores it.
     ///
     /// # Errors
-    /// [`TrackErrorKind::Template`] when the numbers are not above 0, finite, or the nodes'.
+    /// [`TrackErrorKind::Template`] unless there is one finite number above 0 per node.
     pub fn with_stiffness(mut self, of_node: &[f64]) -> Result<Self, TrackError> {
         let nodes = self.translations.len();
         if of_node.len() != nodes || !of_node.iter().all(|s| s.is_finite() && *s > 0.0) {
@@ -140,11 +140,11 @@ impl DeformTracker {
         Ok(self)
     }
 
-    /// Estimates the thickness of clothes on each part where images constrain it, and applies it where they do not. One
-    /// canonical unit normal and one part number a node. Gradient descent knows nothing of it.
+    /// Estimates the thickness of clothes on each part where images constrain it, and applies it where they do not. Takes
+    /// one canonical unit normal and one part number per node. Gradient descent ignores it.
     ///
     /// # Errors
-    /// [`TrackErrorKind::Template`] when the normals are not finite or not the nodes'.
+    /// [`TrackErrorKind::Template`] unless there are one finite normal and one part per node.
     pub fn with_thickness(mut self, normals: Vec<DVec3>, parts: Vec<usize>) -> Result<Self, TrackError> {
         let nodes = self.translations.len();
         if normals.len() != nodes || parts.len() != nodes || !normals.iter().all(|n| n.is_finite()) {
@@ -157,7 +157,7 @@ impl DeformTracker {
         Ok(self)
     }
 
-    /// Back to rest: the next frame counts as the first.
+    /// Resets to rest; the next frame set counts as the first.
     pub fn reset(&mut self) {
         self.translations.fill(DVec3::ZERO);
         self.smooth.fill(DVec3::ZERO);
@@ -170,7 +170,7 @@ impl DeformTracker {
         self.frame = 0;
     }
 
-    /// Keeps what is known of the clothes; the next frame counts as the first again.
+    /// Keeps the translations; the next frame set counts as the first again.
     pub fn restart(&mut self) {
         self.smooth.clone_from(&self.translations);
         self.damping = self.settings.damping;
@@ -178,10 +178,11 @@ impl DeformTracker {
         self.frame = 0;
     }
 
-    /// Resumes from translations of an earlier tracker of the same graph, canonical metres; the next frame counts as the first.
+    /// Resumes from translations of an earlier tracker of the same graph, canonical metres; the next frame set counts as
+    /// the first.
     ///
     /// # Errors
-    /// [`TrackErrorKind::Template`] when they are not the graph's nodes', or not finite.
+    /// [`TrackErrorKind::Template`] unless there is one finite translation per node.
     pub fn resume(&mut self, translations: &[DVec3]) -> Result<(), TrackError> {
         let nodes = self.translations.len();
         if translations.len() != nodes || !translations.iter().all(|t| t.is_finite()) {
@@ -194,26 +195,27 @@ impl DeformTracker {
         Ok(())
     }
 
-    /// Canonical translations of the nodes, metres.
+    /// Returns the canonical translations of the nodes, metres.
     #[must_use]
     pub fn translations(&self) -> &[DVec3] {
         &self.translations
     }
 
-    /// Canonical displacements t_x of the Gaussians (Eq. 2), metres, and their growth in w ([`flyrig_body::displacement`]).
+    /// Returns the canonical displacements t_x of the Gaussians (Eq. 2), metres, with their growth in w
+    /// ([`flyrig_body::displacement`]).
     #[must_use]
     pub fn displacement(&self) -> &[[f32; 4]] {
         &self.displacement
     }
 
-    /// Takes in one frame, starting from the last one's translations.
+    /// Ingests one frame set, starting from the translations of the last one.
     ///
     /// # Errors
-    /// The data term's; the state is then that of the last accepted step.
+    /// Those of the data term; the state is then that of the last accepted step.
     pub fn track<D: DataTerm>(&mut self, data: &mut D) -> Result<DeformReport, D::Error> {
         let mut report = DeformReport::default();
         let start = self.translations.clone();
-        // Before the first frame there is nothing to stay close to.
+        // Before the first frame set there is nothing to stay close to.
         self.regularizer.history = self.frame > 0;
         if let Some(floor) = self.floor.filter(|_| self.frame >= FIRST_FRAMES) {
             let loss = data.loss(&self.displacement)? + self.prior(None);
@@ -234,7 +236,7 @@ impl DeformTracker {
                 self.restore(start);
                 return Ok(report);
             }
-            // Gauss-Newton has told the loss after its step already.
+            // Gauss-Newton has already reported the loss after its step.
             if report.losses.len() == report.accepted {
                 report.losses.push(loss);
             }
@@ -273,7 +275,7 @@ impl DeformTracker {
         Ok(report)
     }
 
-    /// Adds the data's gradient and makes its matrix; the number of Gaussians left out.
+    /// Adds the data's gradient by the nodes and builds its matrix; returns the number of dropped Gaussians.
     fn gather(&mut self, gradient: &mut [DVec3]) -> usize {
         let mut all_dropped = 0;
         let with_matrix = matches!(self.settings.solver, DeformSolver::GaussNewton { .. });
@@ -281,7 +283,7 @@ impl DeformTracker {
         for derivatives in &self.derivatives {
             let (carried, dropped) = to_canonical(derivatives, &self.skin);
             all_dropped += dropped;
-            self.matrix.take_in(&carried, gradient, with_matrix);
+            self.matrix.accumulate(&carried, gradient, with_matrix);
         }
         all_dropped
     }
@@ -291,6 +293,7 @@ impl DeformTracker {
         self.regularizer.loss(&self.translations, &self.smooth, self.thickness.as_ref(), gradient)
     }
 
+    /// Takes a damped Gauss-Newton step, with growing damping until the loss falls or the attempts end.
     fn step_downhill<D: DataTerm>(
         &mut self,
         gradient: &[DVec3],
@@ -307,7 +310,7 @@ impl DeformTracker {
             let by_data = self.matrix.mean_diagonal();
             let damping = self.damping * by_data + LEAST_DAMPING * (by_data + stiffness * self.matrix.mean_edges());
             let step = self.matrix.solve(stiffness, damping + 2.0 * self.regularizer.anchor, &right);
-            // Of the quadratic model, which the step s solves: (A + damping) s = -g.
+            // Decrease of the quadratic model, which the step s solves: (A + damping) s = -g.
             let share = self.shrink(&step);
             let along: f64 = right.iter().zip(&step).map(|(r, s)| r.dot(*s)).sum();
             let squared: f64 = step.iter().map(|s| s.length_squared()).sum();
@@ -335,13 +338,13 @@ impl DeformTracker {
         Ok(())
     }
 
-    /// The share of a step that keeps every node within the longest one.
+    /// Returns the share of a step at which no node moves farther than the longest step.
     fn shrink(&self, step: &[DVec3]) -> f64 {
         let longest = step.iter().map(|s| s.length()).fold(0.0, f64::max);
         if longest > self.settings.max_step_m { self.settings.max_step_m / longest } else { 1.0 }
     }
 
-    /// Moves the nodes within the limits; `None`, and nothing done, when the step is not finite.
+    /// Moves the nodes within the limits; `None`, without any change, when the step is not finite.
     fn step(&mut self, step: &[DVec3]) -> Option<()> {
         if !step.iter().all(|s| s.is_finite()) {
             return None;
@@ -355,6 +358,7 @@ impl DeformTracker {
         Some(())
     }
 
+    /// Sets the translations and the displacements that follow.
     fn restore(&mut self, translations: Vec<DVec3>) {
         self.translations = translations;
         self.displace();
@@ -375,7 +379,7 @@ impl DeformTracker {
         total
     }
 
-    /// Eq. 2.
+    /// Computes the displacements of the Gaussians from those of the nodes (Eq. 2).
     fn displace(&mut self) {
         let (rest, translations) = (&self.rest, &self.translations);
         let hung = self.gaussian_nodes.par_iter().zip(&self.gaussian_weights);

@@ -1,18 +1,18 @@
-//! Face landmarks of one crop.
+//! The face landmark network (MediaPipe Face Mesh, Kartynnik et al. 2019).
 
 use glam::DVec2;
 
-use crate::TrackError;
-use crate::landmark_net::{LandmarkNet, sigmoid};
+use crate::error::TrackError;
+use crate::network::landmark_net::{LandmarkNet, sigmoid};
 
 /// Side of the network's crop, pixels.
 pub const FACE_SIDE: usize = 192;
-/// Landmarks on the surface of a face.
+/// Number of landmarks on the surface of a face.
 pub const FACE_LANDMARKS: usize = 468;
 
 static EMBEDDED: &[u8] = include_bytes!("../../assets/face.onnx");
 
-/// The face landmark network (MediaPipe Face Mesh, Kartynnik et al. 2019; licence beside the file in `assets`).
+/// Network that finds landmarks of a face in a crop; its licence is beside the file in `assets`.
 #[derive(Clone)]
 pub struct FaceNet {
     net: LandmarkNet,
@@ -69,7 +69,7 @@ impl FaceNet {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::TrackErrorKind;
+    use crate::error::TrackErrorKind;
 
     #[test]
     fn the_embedded_network_sees_no_face_in_grey_and_refuses_a_wrong_size() {

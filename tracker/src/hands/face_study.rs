@@ -1,36 +1,40 @@
-//! Learning of the places that the face network's landmarks have on a head.
+//! Measures the places of the face network's landmarks on a head, for the table of
+//! [`face_points`](crate::hands::face_points).
+//!
+//! A landmark's place is the point nearest to its lines of sight in many images of people whose pose is known (iteratively
+//! reweighted least squares).
 
 use flyrig_body::Template;
 use flyrig_types::{Camera, Image, Pose};
 use glam::{DMat3, DVec3};
 
-use super::face_points::RIGID;
-use super::looks::FaceTarget;
-use super::{FaceNet, FaceOutput};
-use crate::TrackError;
-use crate::body_model::BodyModel;
-use crate::habits::template_scale;
-use crate::pixels::Rgb;
-use crate::view::View;
+use crate::error::TrackError;
+use crate::hands::crop_schedule::FaceTarget;
+use crate::hands::face_net::{FACE_SIDE, FaceNet, FaceOutput};
+use crate::hands::face_points::RIGID;
+use crate::image::pixels::Rgb;
+use crate::image::view::View;
+use crate::landmarks::bias::template_scale;
+use crate::pose::body_model::BodyModel;
 
-/// Rounds of reweighting, and the distance that loses half its weight, metres.
+/// Rounds of reweighting, and the distance at which the weight is halved, metres.
 const ROUNDS: usize = 15;
 const ROBUST_M: f64 = 0.006;
-/// Sightings that a landmark needs.
+/// Observations needed for a landmark.
 const MIN_COUNT: usize = 20;
 
-/// A line through a landmark, in axes of the head, metres on a body of 1.7 m: a point on it and its direction.
+/// Line of sight through a landmark, in axes of the head, metres on a body of 1.7 m: the camera and a unit direction.
 #[derive(Debug, Clone, Copy)]
 struct Ray {
     from: DVec3,
     along: DVec3,
 }
 
-/// Places of the network's landmarks, from people whose pose is known.
+/// Measurement of the places of the network's landmarks, on people whose pose is known.
 #[derive(Debug)]
 pub struct FaceStudy {
     net: FaceNet,
-    /// By landmark of [`RIGID`].
+    /// Lines of sight of each landmark of [`RIGID`].
     rays: Vec<Vec<Ray>>,
 }
 
@@ -41,7 +45,7 @@ impl FaceStudy {
         Self { net, rays: vec![Vec::new(); RIGID.len()] }
     }
 
-    /// Measures one image of a person in a known pose of a known body; false where the network sees no face.
+    /// Measures one image of a person in a known pose of a known body; returns false when the network finds no face.
     ///
     /// # Errors
     /// Kinds `Template` and `Image` when those cannot be used, `Net` when the network fails.
@@ -52,12 +56,12 @@ impl FaceStudy {
         template: &Template,
         pose: &Pose,
     ) -> Result<bool, TrackError> {
-        let model = BodyModel::without_habits(template)?;
+        let model = BodyModel::with_anatomical_marks(template)?;
         let Some(turns) = model.to_turns(pose) else { return Ok(false) };
         let posed = model.pose(&turns);
         let scale = template_scale(template);
         let Some(target) = FaceTarget::new(camera, &model, &posed, scale) else { return Ok(false) };
-        let side = super::FACE_SIDE;
+        let side = FACE_SIDE;
         let FaceOutput { landmarks, presence } = self.net.run(&target.crop.sample_square(&Rgb::new(image)?, side))?;
         if presence < 0.5 {
             return Ok(false);
@@ -74,7 +78,8 @@ impl FaceStudy {
         Ok(true)
     }
 
-    /// Returns landmark, place in metres and the median distance of its lines in metres, for all that were seen often enough.
+    /// Returns index, place in metres and the median distance of its lines in metres of each landmark that was seen often
+    /// enough.
     #[must_use]
     pub fn places(&self) -> Vec<(usize, DVec3, f64)> {
         let of = |(landmark, rays): (&usize, &Vec<Ray>)| {
@@ -85,7 +90,7 @@ impl FaceStudy {
     }
 }
 
-/// Point nearest to all lines, robustly, and their median distance from it.
+/// Returns the point nearest to most lines, and their median distance from it, metres.
 fn meeting(rays: &[Ray]) -> Option<(DVec3, f64)> {
     if rays.len() < MIN_COUNT {
         return None;

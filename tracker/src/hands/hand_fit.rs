@@ -1,10 +1,10 @@
 //! Damped least squares of one hand on the landmarks of all views.
 //!
-//! Unknown are the wrist's shift and turn relative to the body's pose and 20 angles of the fingers. The cost adds up halves
-//! of squared residuals over standard deviations: landmark distances in the images (Cauchy weights), the wrist's change,
-//! deviations of angles from the relaxed hand and from the last set, limits of angles, and the coupling of a finger's last
-//! two joints (the last bends about two thirds as far as the one before: Lin, Wu and Huang, "Modeling the constraints of human
-//! hand motion", 2000, eq. 4).
+//! The unknowns are shift and rotation of the wrist relative to the body's pose and 20 angles of the fingers. The cost is
+//! half the sum of squared residuals over standard deviations: landmark distances in the images (Cauchy weights), the
+//! wrist's change, deviations of angles from the relaxed hand and from the last frame set, limits of angles, and the
+//! coupling of a finger's last two joints (the last bends about two thirds as far as the one before: Lin, Wu and Huang,
+//! "Modeling the constraints of human hand motion", 2000, eq. 4).
 
 use flyrig_solve::{
     Convergence, DenseNormal, Kernel, Problem, RigidMotion, exp_rotation, left_jacobian_inverse, log_rotation, minimize,
@@ -12,77 +12,72 @@ use flyrig_solve::{
 use glam::{DQuat, DVec2, DVec3};
 use nalgebra::DVector;
 
-use super::HAND_LANDMARKS;
-use super::hand_model::{Bends, BentHand, HandModel, moving, range, relaxed};
-use crate::view::View;
+use crate::hands::hand_model::{Bends, BentHand, HandModel, moving, range, relaxed};
+use crate::hands::hand_net::HAND_LANDMARKS;
+use crate::hands::sight::Sight;
 
-/// Unknowns: shift, turn, four angles of five fingers.
+/// Number of unknowns: shift, rotation, four angles of five fingers.
 const SIZE: usize = 26;
-/// Standard deviation of a landmark, metres and pixels of the image.
+/// Standard deviation of a landmark, metres.
 const SPREAD_M: f64 = 0.006;
-const SPREAD_PX: f64 = 1.0;
-/// Residuals of this many standard deviations lose half their weight.
+/// Residual at which a landmark loses half its weight, standard deviations.
 const ROBUST: f64 = 2.0;
-/// Standard deviations of the body's wrist: place in metres, turn in radians.
+/// Standard deviations of the body's wrist: place in metres, rotation in radians.
 const WRIST_SHIFT_M: f64 = 0.02;
 const WRIST_TURN_RAD: f64 = 0.35;
-/// How sharply an angle's limit is enforced, radians.
+/// Standard deviation beyond an angle's limit, radians.
 const LIMIT_RAD: f64 = 0.05;
-/// Share of the second joint's flexion that the third one follows with, and the standard deviation, radians.
+/// Flexion of the third joint as a share of the second's, and the standard deviation, radians.
 const COUPLING: f64 = 2.0 / 3.0;
 const COUPLING_RAD: f64 = 0.3;
-/// Steps of the solver.
+/// Largest number of solver steps.
 const MAX_STEPS: usize = 30;
 
-/// The landmarks of one view.
+/// Landmarks of a hand in one view.
 #[derive(Debug, Clone)]
 pub(crate) struct HandSight {
-    pub view: View,
-    /// Pixels from the principal point, without distortion.
+    pub sight: Sight,
+    /// Undistorted pixels from the principal point.
     pub seen: [Option<DVec2>; HAND_LANDMARKS],
-    /// Importance, 0..=1.
-    pub trust: f64,
-    /// From the world at the set's time to where the hand was in this image, as far as the wrist moved it.
-    pub carry: RigidMotion,
 }
 
-/// A hand relative to the body's pose.
+/// Hand relative to the body's pose.
 #[derive(Debug, Clone, PartialEq)]
 pub(crate) struct HandPose {
-    /// Of the wrist, world metres.
+    /// Shift of the wrist, world metres.
     pub shift: DVec3,
-    /// On the left of the wrist's rotation, world axes.
+    /// Rotation applied after the wrist's own, world axes.
     pub turn: DQuat,
     pub bends: Bends,
 }
 
 impl HandPose {
-    /// As the body has it, fingers relaxed.
+    /// Returns the hand in the body's pose with relaxed fingers.
     pub fn relaxed() -> Self {
         Self { shift: DVec3::ZERO, turn: DQuat::IDENTITY, bends: relaxed() }
     }
 }
 
-/// Data and priors of a hand.
+/// Measurements and priors of a hand.
 #[derive(Debug, Clone)]
 pub(crate) struct HandProblem<'a> {
     pub model: &'a HandModel,
     pub sights: &'a [HandSight],
-    /// Rotation of the hand's flesh from canonical axes to the world, and the wrist's place, by the body's pose.
+    /// Rotation of the hand's flesh from canonical axes to the world, and the wrist's place in metres, by the body's pose.
     pub wrist: RigidMotion,
-    /// Angles at the last set and their standard deviation since, radians.
+    /// Angles at the last frame set and the standard deviation of their change since, radians.
     pub before: Option<(Bends, f64)>,
 }
 
 impl HandProblem<'_> {
-    /// World places of the landmarks and the bent hand.
+    /// Returns the world places of the landmarks, metres, and the bent hand.
     pub fn points(&self, at: &HandPose) -> ([DVec3; HAND_LANDMARKS], BentHand) {
         let bent = self.model.bend(&at.bends);
         let (origin, rotation) = (self.wrist.translation + at.shift, at.turn * self.wrist.rotation);
         (bent.points.map(|point| origin + rotation * point), bent)
     }
 
-    /// Minimizes from a start; `None` when nothing finite is found.
+    /// Minimises from a start; returns the pose and its cost, `None` when it is not finite.
     pub fn solve(&self, start: &HandPose) -> Option<(HandPose, f64)> {
         let options = Convergence { max_steps: MAX_STEPS, min_gain: 1e-4, ..Convergence::default() };
         let solution = minimize(self, start, &options)?;
@@ -93,21 +88,20 @@ impl HandProblem<'_> {
         finite.then_some((pose, solution.cost))
     }
 
-    /// Median distance of a view's landmarks, standard deviations and pixels; `None` without any.
-    pub fn residual(&self, at: &HandPose, sight: &HandSight) -> Option<(f64, f64)> {
+    /// Returns the median residual of a view's landmarks, standard deviations and pixels; `None` without any.
+    pub fn residual(&self, at: &HandPose, hand: &HandSight) -> Option<(f64, f64)> {
         let (points, _) = self.points(at);
         let (mut sigmas, mut pixels) = (Vec::new(), Vec::new());
-        for (point, seen) in points.iter().zip(&sight.seen) {
-            let moved = sight.carry.apply(*point);
-            let (Some(seen), Some(pixel)) = (seen, sight.view.project(moved)) else { continue };
+        for (point, seen) in points.iter().zip(&hand.seen) {
+            let (Some(seen), Some(pixel)) = (seen, hand.sight.project(*point)) else { continue };
             let distance = pixel.distance(*seen);
-            sigmas.push(distance / spread_px(sight, self.wrist.translation)?);
+            sigmas.push(distance / hand.sight.spread_px(self.wrist.translation, SPREAD_M)?);
             pixels.push(distance);
         }
         Some((flyrig_solve::median(&mut sigmas)?, flyrig_solve::median(&mut pixels)?))
     }
 
-    /// Calls `each` with every residual of an angle, (index of the angle, derivative) pairs, and the residual.
+    /// Calls `each` with every residual of the angles: pairs (index of the angle, derivative), and the residual.
     fn angle_terms(&self, bends: &Bends, mut each: impl FnMut(&[(usize, f64)], f64)) {
         for (finger, angles) in bends.iter().enumerate() {
             for (k, &angle) in angles.iter().enumerate() {
@@ -137,25 +131,17 @@ impl HandProblem<'_> {
     fn sight_terms(&self, at: &HandPose, mut each: impl FnMut(usize, DVec3, [DVec3; 2], DVec2, f64, f64)) {
         let (points, _) = self.points(at);
         let kernel = Kernel::Cauchy(ROBUST);
-        for sight in self.sights {
-            let Some(spread) = spread_px(sight, self.wrist.translation) else { continue };
-            let back = sight.carry.rotation.inverse();
-            for (index, (point, seen)) in points.iter().zip(&sight.seen).enumerate() {
+        for HandSight { sight, seen } in self.sights {
+            let Some(spread) = sight.spread_px(self.wrist.translation, SPREAD_M) else { continue };
+            for (index, (point, seen)) in points.iter().zip(seen).enumerate() {
                 let Some(seen) = seen else { continue };
-                let Some((pixel, rows)) = sight.view.project_with_derivative(sight.carry.apply(*point)) else {
-                    continue;
-                };
+                let Some((pixel, rows)) = sight.project_with_derivative(*point) else { continue };
                 let error = (pixel - *seen) / spread;
                 let (cost, weight) = kernel.weigh(error.length_squared(), sight.trust);
-                each(index, *point, rows.map(|row| back * row / spread), error, weight, cost);
+                each(index, *point, rows.map(|row| row / spread), error, weight, cost);
             }
         }
     }
-}
-
-/// Standard deviation of a landmark in a view, pixels; `None` behind the camera.
-fn spread_px(sight: &HandSight, wrist: DVec3) -> Option<f64> {
-    Some((SPREAD_M * sight.view.px_per_m(wrist)?).hypot(SPREAD_PX))
 }
 
 impl Problem for HandProblem<'_> {
@@ -228,6 +214,7 @@ impl Problem for HandProblem<'_> {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::image::view::View;
     use crate::testing::{body, ring};
     use rand::{RngExt, SeedableRng, rngs::StdRng};
 
@@ -258,7 +245,7 @@ mod tests {
             let view = View::new(camera);
             let carry = if slot == 1 { carry } else { RigidMotion::IDENTITY };
             let seen = points.map(|point| view.project(carry.apply(point)));
-            HandSight { view, seen, trust: 1.0, carry }
+            HandSight { sight: Sight { view, trust: 1.0, carry }, seen }
         };
         ring(count).cameras.iter().enumerate().map(sight).collect()
     }

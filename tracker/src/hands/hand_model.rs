@@ -1,69 +1,69 @@
-//! A hand of a template: where the network's 21 landmarks lie, and how fingers bend.
+//! Model of a template's hand: the network's 21 landmarks as a function of the fingers' angles, and the ranges of these.
 
 use flyrig_body::{FingerAxes, Template, finger_axes};
 use glam::{DQuat, DVec3};
 
-use super::HAND_LANDMARKS;
-use crate::anatomy::Roles;
-use crate::{TrackError, TrackErrorKind};
+use crate::error::{TrackError, TrackErrorKind};
+use crate::hands::hand_net::HAND_LANDMARKS;
+use crate::pose::anatomy::Roles;
 
-/// Angles of a finger, radians: flexion and spread of its first joint, flexion of the second and of the third.
+/// Angles of a finger, radians: flexion and spread of the first joint, flexion of the second and of the third.
 pub(crate) type Bend = [f64; 4];
 /// Angles of a hand, thumb first.
 pub(crate) type Bends = [Bend; 5];
 
-/// Range of a finger's angles, radians: smallest, largest, relaxed, standard deviation about it.
+/// Range of each angle of a finger, radians: smallest, largest, relaxed, and standard deviation about the relaxed one.
 pub(crate) const FINGER_RANGE: [[f64; 4]; 4] =
     [[-0.35, 1.6, 0.30, 0.6], [-0.4, 0.4, 0.0, 0.15], [-0.05, 1.9, 0.40, 0.6], [-0.1, 1.3, 0.25, 0.4]];
-/// The same of the thumb.
+/// Range of each angle of the thumb; see [`FINGER_RANGE`].
 pub(crate) const THUMB_RANGE: [[f64; 4]; 4] =
     [[-0.6, 0.9, 0.15, 0.35], [-0.7, 0.7, 0.05, 0.3], [-0.4, 1.1, 0.15, 0.35], [-0.4, 1.4, 0.15, 0.45]];
 
-/// Range of one angle of one finger.
+/// Returns the range of one angle of one finger; see [`FINGER_RANGE`].
 pub(crate) fn range(finger: usize, angle: usize) -> [f64; 4] {
     if finger == 0 { THUMB_RANGE[angle] } else { FINGER_RANGE[angle] }
 }
 
-/// Fingers of somebody who does nothing with them.
+/// Returns the angles of a relaxed hand.
 pub(crate) fn relaxed() -> Bends {
     std::array::from_fn(|finger| std::array::from_fn(|angle| range(finger, angle)[2]))
 }
 
-/// One hand.
+/// Hand of a template.
 #[derive(Debug, Clone)]
 pub(crate) struct HandModel {
-    /// The wrist's joint.
+    /// Joint of the wrist.
     pub hand: usize,
     /// Joints of each finger.
     pub joints: [[usize; 3]; 5],
-    /// The wrist in canonical space, metres.
+    /// Wrist in canonical space, metres.
     origin: DVec3,
     axes: [FingerAxes; 5],
-    /// From the wrist to the first joint, and on to the second, the third and the tip; canonical axes, metres.
+    /// Offsets from the wrist to the first joint, and on to the second, the third and the tip; canonical axes, metres.
     offsets: [[DVec3; 4]; 5],
-    /// Wrist to the tip of the stretched middle finger, metres.
+    /// Length from the wrist to the tip of the stretched middle finger, metres.
     pub length_m: f64,
 }
 
-/// A hand with its fingers bent, in canonical axes from the wrist, metres.
+/// Hand with bent fingers, canonical axes relative to the wrist, metres.
 #[derive(Debug, Clone)]
 pub(crate) struct BentHand {
-    /// The network's landmarks.
+    /// Landmarks in the network's order.
     pub points: [DVec3; HAND_LANDMARKS],
-    /// Axes that each finger's angles turn about, and points on them.
+    /// Axes of each finger's angles, and points on them.
     pub axes: [[(DVec3, DVec3); 4]; 5],
 }
 
-/// Angles of a finger that move its landmark `place` (0 to 3): none, the first joint's, and so on.
+/// Returns the angles of a finger that move its landmark `place` (0 to 3): none, those of the first joint, and so on.
 pub(crate) fn moving(place: usize) -> std::ops::Range<usize> {
     0..[0, 2, 3, 4][place]
 }
 
 impl HandModel {
-    /// The left and the right hand of a template with fingers.
+    /// Returns the left and the right hand of a template with fingers.
     ///
     /// # Errors
-    /// Kind `Template` when it has none.
+    /// Kind `Template` when it has no fingers, or fingers without vertices.
     pub fn pair(template: &Template) -> Result<[Self; 2], TrackError> {
         let error = |message: &str| {
             TrackError::new(TrackErrorKind::Template, format!("template '{}' {message}", template.name))
@@ -97,7 +97,7 @@ impl HandModel {
         }
     }
 
-    /// Joint and canonical place at rest of each landmark.
+    /// Returns joint and canonical place at rest of each landmark, metres.
     pub fn marks(&self) -> [(usize, DVec3); HAND_LANDMARKS] {
         let mut marks = [(self.hand, self.origin); HAND_LANDMARKS];
         for finger in 0..5 {
@@ -110,7 +110,7 @@ impl HandModel {
         marks
     }
 
-    /// Bends the fingers.
+    /// Bends the fingers by angles in radians.
     pub fn bend(&self, bends: &Bends) -> BentHand {
         let mut bent = BentHand { points: [DVec3::ZERO; HAND_LANDMARKS], axes: [[(DVec3::ZERO, DVec3::ZERO); 4]; 5] };
         for (finger, &[first, spread, second, third]) in bends.iter().enumerate() {
@@ -131,14 +131,15 @@ impl HandModel {
         bent
     }
 
-    /// Turns of a finger's joints away from rest, canonical axes.
+    /// Returns the rotations of a finger's joints away from rest, canonical axes.
     pub fn turns(&self, finger: usize, [first, spread, second, third]: Bend) -> [DQuat; 3] {
         let axes = &self.axes[finger];
         [axes.turn(first, spread), axes.turn(second, 0.0), axes.turn(third, 0.0)]
     }
 }
 
-/// Middle of the fingertip: of the flesh on the last joint within 6 mm of its end.
+/// Returns the middle of the fingertip: the mean of the flesh on the last joint within 6 mm of its end; `None` without
+/// vertices.
 fn tip(template: &Template, joint: usize, origin: DVec3, along: DVec3) -> Option<DVec3> {
     const END_M: f64 = 0.006;
     let own = |(_, skin): &(&glam::Vec3, &flyrig_body::SkinWeights)| usize::from(skin.joints[0]) == joint;

@@ -1,18 +1,18 @@
-//! Hand landmarks of one crop.
+//! The hand landmark network (MediaPipe Hands, Zhang et al. 2020, lite).
 
 use glam::DVec2;
 
-use crate::TrackError;
-use crate::landmark_net::LandmarkNet;
+use crate::error::TrackError;
+use crate::network::landmark_net::LandmarkNet;
 
 /// Side of the network's crop, pixels.
 pub const HAND_SIDE: usize = 224;
-/// Landmarks of a hand: wrist, then four of each finger from the palm to the tip, thumb first.
+/// Number of landmarks of a hand: wrist, then four of each finger from the palm to the tip, thumb first.
 pub const HAND_LANDMARKS: usize = 21;
 
 static EMBEDDED: &[u8] = include_bytes!("../../assets/hand_lite.onnx");
 
-/// The hand landmark network (MediaPipe Hands, Zhang et al. 2020, lite; licence beside the file in `assets`).
+/// Network that finds landmarks of a hand in a crop; its licence is beside the file in `assets`.
 #[derive(Clone)]
 pub struct HandNet {
     net: LandmarkNet,
@@ -70,7 +70,7 @@ impl HandNet {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::TrackErrorKind;
+    use crate::error::TrackErrorKind;
 
     #[test]
     fn the_embedded_network_sees_no_hand_in_grey_and_refuses_a_wrong_size() {

@@ -1,7 +1,8 @@
 //! Damped least squares of the head's rotation on the face landmarks of all views.
 //!
-//! Unknown are shift and turn relative to the body's pose and the size of the face. The landmarks lie at learnt places of an
-//! average face ([`FACE_POINTS`](super::face_points::FACE_POINTS)); size and shift take up what differs from person to person.
+//! The unknowns are shift and rotation relative to the body's pose and the size of the face. The landmarks lie at measured
+//! places of an average face ([`FACE_POINTS`](crate::hands::face_points::FACE_POINTS)); size and shift absorb the
+//! differences between people.
 
 use flyrig_solve::{
     Convergence, DenseNormal, Kernel, Problem, RigidMotion, exp_rotation, left_jacobian_inverse, log_rotation, minimize,
@@ -9,108 +10,97 @@ use flyrig_solve::{
 use glam::{DQuat, DVec2, DVec3};
 use nalgebra::DVector;
 
-use crate::view::View;
+use crate::hands::sight::Sight;
 
-/// Unknowns: shift, turn, logarithm of the size.
+/// Number of unknowns: shift, rotation, logarithm of the size.
 const SIZE: usize = 7;
-/// Standard deviation of a landmark, metres and pixels of the image.
+/// Standard deviation of a landmark, metres.
 const SPREAD_M: f64 = 0.005;
-const SPREAD_PX: f64 = 1.0;
-/// Residuals of this many standard deviations lose half their weight.
+/// Residual at which a landmark loses half its weight, standard deviations.
 const ROBUST: f64 = 2.0;
-/// Standard deviations of the body's head: place in metres, turn in radians; of the size, logarithm.
+/// Standard deviations of the body's head: place in metres, rotation in radians, logarithm of the size.
 const SHIFT_M: f64 = 0.02;
 const TURN_RAD: f64 = 0.5;
 const LN_SIZE: f64 = 0.08;
-/// Landmarks of a view that count as many measurements; more of them share their weight, for they err alike.
+/// Number of independent measurements that the landmarks of a view are worth: more of them share their weight, since their
+/// errors are correlated.
 const COUNT: f64 = 12.0;
-/// Steps of the solver.
+/// Largest number of solver steps.
 const MAX_STEPS: usize = 20;
 
-/// The face in one view.
+/// Landmarks of the face in one view.
 #[derive(Debug, Clone)]
 pub(crate) struct FaceSight {
-    pub view: View,
-    /// Pixels from the principal point, without distortion, and the place on the head: canonical axes from the head's joint,
+    pub sight: Sight,
+    /// Undistorted pixels from the principal point, and the place on the head: canonical axes from the head's joint,
     /// metres.
     pub seen: Vec<(DVec2, DVec3)>,
-    /// Importance, 0..=1.
-    pub trust: f64,
-    /// From the world at the set's time to where the head was in this image, as far as its joint moved it.
-    pub carry: RigidMotion,
 }
 
-/// A head relative to the body's pose.
+/// Head relative to the body's pose.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub(crate) struct HeadPose {
-    /// World metres.
+    /// Shift of the joint, world metres.
     pub shift: DVec3,
-    /// On the left of the head's rotation, world axes.
+    /// Rotation applied after the head's own, world axes.
     pub turn: DQuat,
     /// Logarithm of the size of the face.
     pub ln_size: f64,
 }
 
 impl HeadPose {
-    /// As the body has it.
+    /// Returns the head in the body's pose.
     pub fn unmoved() -> Self {
         Self { shift: DVec3::ZERO, turn: DQuat::IDENTITY, ln_size: 0.0 }
     }
 }
 
-/// Data and priors of the head.
+/// Measurements and priors of the head.
 #[derive(Debug, Clone)]
 pub(crate) struct HeadProblem<'a> {
     pub sights: &'a [FaceSight],
-    /// Rotation of the head's flesh from canonical axes to the world, and its joint's place, by the body's pose.
+    /// Rotation of the head's flesh from canonical axes to the world, and its joint's place in metres, by the body's pose.
     pub head: RigidMotion,
 }
 
 impl HeadProblem<'_> {
-    /// Minimizes from the body's head; `None` when nothing finite is found.
+    /// Minimises from the body's head; `None` when the result is not finite.
     pub fn solve(&self) -> Option<HeadPose> {
         let options = Convergence { max_steps: MAX_STEPS, min_gain: 1e-5, ..Convergence::default() };
         let pose = minimize(self, &HeadPose::unmoved(), &options)?.unknowns;
         (pose.shift.is_finite() && pose.turn.is_finite() && pose.ln_size.is_finite()).then_some(pose)
     }
 
+    /// Returns the world place of a point of the head, metres.
     fn place(&self, at: &HeadPose, point: DVec3) -> DVec3 {
         self.head.translation + at.shift + at.turn * (self.head.rotation * point) * at.ln_size.exp()
     }
 
-    /// Median distance of a view's landmarks, standard deviations and pixels; `None` without any.
-    pub fn residual(&self, at: &HeadPose, sight: &FaceSight) -> Option<(f64, f64)> {
-        let spread = spread_px(sight, self.head.translation)?;
-        let distance = |(seen, point): &(DVec2, DVec3)| {
-            Some(sight.view.project(sight.carry.apply(self.place(at, *point)))?.distance(*seen))
-        };
-        let mut pixels: Vec<f64> = sight.seen.iter().filter_map(distance).collect();
+    /// Returns the median residual of a view's landmarks, standard deviations and pixels; `None` without any.
+    pub fn residual(&self, at: &HeadPose, face: &FaceSight) -> Option<(f64, f64)> {
+        let spread = face.sight.spread_px(self.head.translation, SPREAD_M)?;
+        let distance =
+            |(seen, point): &(DVec2, DVec3)| Some(face.sight.project(self.place(at, *point))?.distance(*seen));
+        let mut pixels: Vec<f64> = face.seen.iter().filter_map(distance).collect();
         let median = flyrig_solve::median(&mut pixels)?;
         Some((median / spread, median))
     }
 
-    /// Calls `each` with every landmark's world place, the rows of derivatives by it, residuals, weight and cost.
+    /// Calls `each` with every landmark's world place, the two rows of derivatives by it, residuals, weight and cost.
     fn sight_terms(&self, at: &HeadPose, mut each: impl FnMut(DVec3, [DVec3; 2], DVec2, f64, f64)) {
         let kernel = Kernel::Cauchy(ROBUST);
-        for sight in self.sights {
-            let Some(spread) = spread_px(sight, self.head.translation) else { continue };
-            let back = sight.carry.rotation.inverse();
-            let importance = sight.trust * (COUNT / sight.seen.len() as f64).min(1.0);
-            for (seen, point) in &sight.seen {
+        for FaceSight { sight, seen } in self.sights {
+            let Some(spread) = sight.spread_px(self.head.translation, SPREAD_M) else { continue };
+            let importance = sight.trust * (COUNT / seen.len() as f64).min(1.0);
+            for (seen, point) in seen {
                 let place = self.place(at, *point);
-                let Some((pixel, rows)) = sight.view.project_with_derivative(sight.carry.apply(place)) else {
-                    continue;
-                };
+                let Some((pixel, rows)) = sight.project_with_derivative(place) else { continue };
                 let error = (pixel - *seen) / spread;
                 let (cost, weight) = kernel.weigh(error.length_squared(), importance);
-                each(place, rows.map(|row| back * row / spread), error, weight, cost);
+                each(place, rows.map(|row| row / spread), error, weight, cost);
             }
         }
     }
-}
-
-fn spread_px(sight: &FaceSight, head: DVec3) -> Option<f64> {
-    Some((SPREAD_M * sight.view.px_per_m(head)?).hypot(SPREAD_PX))
 }
 
 impl Problem for HeadProblem<'_> {
@@ -169,6 +159,7 @@ impl Problem for HeadProblem<'_> {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::image::view::View;
     use crate::testing::ring;
 
     fn head() -> RigidMotion {
@@ -193,7 +184,7 @@ mod tests {
             let view = View::new(camera);
             let seen = (0..30).filter_map(|k| Some((view.project(problem.place(&truth(), point(k)))?, point(k))));
             let seen: Vec<_> = seen.collect();
-            FaceSight { view, seen, trust: 1.0, carry: RigidMotion::IDENTITY }
+            FaceSight { sight: Sight { view, trust: 1.0, carry: RigidMotion::IDENTITY }, seen }
         };
         ring(count).cameras.iter().map(sight).collect()
     }

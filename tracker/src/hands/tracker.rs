@@ -1,4 +1,7 @@
-//! Fingers and head of one person through the frame sets of a rig.
+//! Tracks fingers and head of one person through the frame sets of a rig.
+//!
+//! Per frame set: the networks run on the stalest crops within the budget, then each hand and the head are fitted to the
+//! landmarks of all views. Views whose median residual is too large are dropped, and the fit is repeated without them.
 
 use std::time::Instant;
 
@@ -8,45 +11,45 @@ use flyrig_types::{Camera, FrameSet, Pose, Rig};
 use glam::{DQuat, DVec3};
 use rayon::prelude::*;
 
-use super::face_points::FACE_POINTS;
-use super::hand_fit::{HandPose, HandProblem, HandSight};
-use super::hand_model::{Bends, HandModel, relaxed};
-use super::head_fit::{FaceSight, HeadProblem};
-use super::looks::{FORGET_SECS, FaceTarget, PartLook, hand_crop};
-use super::{
-    FACE_SIDE, FaceNet, HAND_LANDMARKS, HAND_SIDE, HandNet, HandQuality, HandState, HandsQuality, HeadQuality,
-};
-use crate::body_model::{BodyModel, Posed};
-use crate::crop::Crop;
-use crate::estimator::check_size;
-use crate::habits::template_scale;
-use crate::pixels::Rgb;
-use crate::view::View;
-use crate::{TrackError, TrackErrorKind};
+use crate::error::{TrackError, TrackErrorKind};
+use crate::hands::crop_schedule::{FORGET_SECS, FaceTarget, PartInference, hand_crop};
+use crate::hands::face_net::{FACE_SIDE, FaceNet};
+use crate::hands::face_points::FACE_POINTS;
+use crate::hands::hand_fit::{HandPose, HandProblem, HandSight};
+use crate::hands::hand_model::{Bends, HandModel, relaxed};
+use crate::hands::hand_net::{HAND_LANDMARKS, HAND_SIDE, HandNet};
+use crate::hands::head_fit::{FaceSight, HeadProblem};
+use crate::hands::quality::{HandQuality, HandState, HandsQuality, HeadQuality};
+use crate::hands::sight::Sight;
+use crate::image::crop::Crop;
+use crate::image::pixels::Rgb;
+use crate::image::view::View;
+use crate::landmarks::bias::template_scale;
+use crate::pose::body_model::{BodyModel, PosedSkeleton};
 
-/// Presence from which a network's landmarks are believed.
+/// Least presence of a usable inference.
 const MIN_PRESENCE: f64 = 0.5;
-/// Views whose median landmark is farther off than so many standard deviations see something else.
+/// Median residual above which a view shows something else, standard deviations.
 const OFF_HAND: f64 = 3.0;
-/// Change of an angle between sets at 30 sets a second, radians.
+/// Standard deviation of an angle's change between frame sets at 30 frame sets per second, radians.
 const SMOOTH_RAD: f64 = 0.3;
-/// The body's wrist moves no faster, metres a second.
+/// Limit of the speed of wrists and head, metres per second.
 const MAX_SPEED: f64 = 12.0;
-/// Left hand, right hand, head.
+/// Number of parts: left hand, right hand, head.
 const PARTS: usize = 3;
 const HEAD: usize = 2;
 
-/// Limits of need and budget.
+/// Settings of [`HandTracker`].
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct HandConfig {
-    /// Smallest length of a hand, wrist to fingertip, that the network looks at, pixels.
+    /// Least length of a hand, wrist to fingertip, for the network to run, pixels.
     pub min_hand_px: f64,
-    /// Smallest height of a face that the network looks at, pixels.
+    /// Least height of a face for the network to run, pixels.
     pub min_face_px: f64,
-    /// Crops that the networks look at in a set, hands and faces together; 0 for all that are due.
+    /// Most crops per frame set, hands and faces together; 0 for all that are due.
     pub crops: usize,
-    /// Motion of a hand or head in metres, or of their flesh through a turn, until a view of it gets a new look. Looks
-    /// grow old by themselves.
+    /// Motion of a hand or head, or of its flesh through rotation, until the network runs on a view of it again, metres.
+    /// Inferences also become stale with age.
     pub look_after_m: f64,
     /// Whether fingers are estimated.
     pub fingers: bool,
@@ -60,7 +63,7 @@ impl Default for HandConfig {
     }
 }
 
-/// Bends the fingers and turns the head of a body whose pose is estimated otherwise.
+/// Tracker of the fingers and the head of a body whose pose is estimated otherwise.
 #[derive(Debug, Clone)]
 pub struct HandTracker {
     hand_net: HandNet,
@@ -71,12 +74,12 @@ pub struct HandTracker {
     body: BodyModel,
     hands: [HandModel; 2],
     scale: f64,
-    /// By part, then slot.
-    looks: [Vec<Option<PartLook>>; PARTS],
+    /// Last inference of each part and slot.
+    inferences: [Vec<Option<PartInference>>; PARTS],
     last: Option<Last>,
 }
 
-/// State after a set.
+/// State after a frame set.
 #[derive(Debug, Clone)]
 struct Last {
     nanos: i64,
@@ -85,17 +88,18 @@ struct Last {
     bends: [Bends; 2],
 }
 
-/// A crop that a network may look at.
+/// Crop that a network may run on.
 struct Candidate {
     part: usize,
     slot: usize,
     crop: Crop,
-    /// See [`PartLook::staleness_m`]; infinite without a look.
+    /// See [`PartInference::staleness_m`]; infinite without an inference.
     staleness_m: f64,
 }
 
 impl HandTracker {
-    /// For a body in the shape of `template`, which gets fingers if it has none, and the cameras of `rig`.
+    /// Creates a tracker for a body in the shape of `template`, which gets fingers if it has none, and the cameras of
+    /// `rig`.
     ///
     /// # Errors
     /// Kind `Template` for a body that cannot have fingers, `Rig` for a rig without cameras, `Net` when a network does not
@@ -104,7 +108,7 @@ impl HandTracker {
         Self::with_nets(HandNet::embedded()?, FaceNet::embedded()?, template, rig, config)
     }
 
-    /// As [`Self::new`], with networks that are loaded already.
+    /// Creates a tracker with networks that are loaded already; see [`Self::new`].
     ///
     /// # Errors
     /// Kinds `Template` and `Rig` as those of [`Self::new`].
@@ -129,19 +133,19 @@ impl HandTracker {
             body,
             hands,
             template,
-            looks: std::array::from_fn(|_| vec![None; slots]),
+            inferences: std::array::from_fn(|_| vec![None; slots]),
             last: None,
         })
     }
 
-    /// The template with fingers that poses are for.
+    /// Returns the template with fingers that poses refer to.
     #[must_use]
     pub fn template(&self) -> &Template {
         &self.template
     }
 
-    /// World places of the hand landmarks in a pose of [`Self::template`], metres: left, right. `None` for a pose that does
-    /// not fit.
+    /// Returns the world places of the hand landmarks in a pose of [`Self::template`], metres: left, right. `None` for a
+    /// pose that does not fit.
     #[must_use]
     pub fn hand_landmarks(&self, pose: &Pose) -> Option<[[DVec3; HAND_LANDMARKS]; 2]> {
         self.template.skeleton.check_pose(pose).ok()?;
@@ -150,23 +154,26 @@ impl HandTracker {
         Some([of(&self.hands[0]), of(&self.hands[1])])
     }
 
-    /// World rotation of the head's flesh from canonical axes in a pose of [`Self::template`]; `None` for a pose that does not
-    /// fit.
+    /// Returns the rotation of the head's flesh from canonical axes to the world in a pose of [`Self::template`]; `None`
+    /// for a pose that does not fit.
     #[must_use]
     pub fn head_rotation(&self, pose: &Pose) -> Option<DQuat> {
         let turns = self.body.to_turns(pose)?;
         Some(self.body.pose(&turns).rotation[self.body.roles.head])
     }
 
-    /// A camera stands elsewhere from the next set on. A slot that does not exist changes nothing.
+    /// Replaces a camera that has moved, from the next frame set on. Slots that do not exist are ignored.
     pub fn move_camera(&mut self, slot: usize, camera: &Camera) {
         if let Some(known) = self.rig.cameras.get_mut(slot) {
             known.clone_from(camera);
-            self.looks.iter_mut().filter_map(|looks| looks.get_mut(slot)).for_each(|look| *look = None);
+            self.inferences
+                .iter_mut()
+                .filter_map(|inferences| inferences.get_mut(slot))
+                .for_each(|inference| *inference = None);
         }
     }
 
-    /// Takes a template of another shape and forgets what was seen.
+    /// Replaces the template and forgets all inferences.
     ///
     /// # Errors
     /// Kind `Template` for a body that cannot have fingers.
@@ -176,18 +183,18 @@ impl HandTracker {
         Ok(())
     }
 
-    /// Forgets what was seen: the person was lost.
+    /// Forgets all inferences, as after the loss of the person.
     pub fn reset(&mut self) {
-        self.looks.iter_mut().flatten().for_each(|look| *look = None);
+        self.inferences.iter_mut().flatten().for_each(|inference| *inference = None);
         self.last = None;
     }
 
-    /// Returns the pose with the finger joints of [`Self::template`] and the head turned, from the body's pose at the set's
-    /// time. The body's pose may lack rotations for the finger joints.
+    /// Estimates fingers and head, from the body's pose at the frame set's time, which may lack rotations of the finger
+    /// joints. Returns a pose of [`Self::template`].
     ///
     /// # Errors
-    /// Kind `Template` for a pose that does not fit, `Frames` and `Image` for a set that does not fit the rig, `Net` when a
-    /// network fails. The state stays sound.
+    /// Kind `Template` for a pose that does not fit, `Frames` and `Image` for a frame set that does not fit the rig, `Net`
+    /// when a network fails. The state stays valid.
     pub fn estimate(&mut self, set: &FrameSet, pose: &Pose) -> Result<(Pose, HandsQuality), TrackError> {
         if set.frames.len() != self.rig.cameras.len() {
             return Err(TrackError::new(
@@ -220,13 +227,13 @@ impl HandTracker {
             .take()
             .filter(|last| (0.0..FORGET_SECS).contains(&(1e-9 * nanos.saturating_sub(last.nanos) as f64)));
         if last.is_none() {
-            self.looks.iter_mut().flatten().for_each(|look| *look = None);
+            self.inferences.iter_mut().flatten().for_each(|inference| *inference = None);
         }
         let velocity = velocities(last.as_ref(), &frames, nanos);
 
         let start = Instant::now();
         let (candidates, largest_px) = self.candidates(set, &posed, &frames, last.as_ref());
-        let crops = self.look(set, candidates, &frames, &velocity)?;
+        let crops = self.infer(set, candidates, &frames, &velocity)?;
         let net_secs = start.elapsed().as_secs_f64();
 
         let start = Instant::now();
@@ -263,7 +270,7 @@ impl HandTracker {
         Ok((self.body.to_pose(&turns), HandsQuality { hands, head, crops, seconds }))
     }
 
-    /// The pose with rotations at rest for joints that it lacks.
+    /// Returns the pose with rotations at rest for joints that it lacks.
     fn extended(&self, pose: &Pose) -> Pose {
         let mut pose = pose.clone();
         let rest = self.template.skeleton.joints().iter().map(|joint| joint.rest_rotation);
@@ -271,16 +278,17 @@ impl HandTracker {
         pose
     }
 
-    fn frames(&self, posed: &Posed) -> [RigidMotion; PARTS] {
+    /// Returns rotation and place of each part in the world.
+    fn frames(&self, posed: &PosedSkeleton) -> [RigidMotion; PARTS] {
         [self.hands[0].hand, self.hands[1].hand, self.body.roles.head]
             .map(|joint| RigidMotion { rotation: posed.rotation[joint], translation: posed.origin[joint] })
     }
 
-    /// Crops of hands and faces that are large enough, and the largest length of each hand, pixels.
+    /// Returns the crops of hands and faces that are large enough, and the largest length of each hand, pixels.
     fn candidates(
         &self,
         set: &FrameSet,
-        posed: &Posed,
+        posed: &PosedSkeleton,
         frames: &[RigidMotion; PARTS],
         last: Option<&Last>,
     ) -> (Vec<Candidate>, [f64; 2]) {
@@ -290,9 +298,9 @@ impl HandTracker {
             let camera = &self.rig.cameras[slot];
             let view = View::new(camera);
             let mut offer = |part: usize, crop: Crop, reach_m: f64| {
-                let look = self.looks[part][slot].as_ref();
-                let staleness_m =
-                    look.map_or(f64::INFINITY, |look| look.staleness_m(&frames[part], reach_m, set.master_nanos));
+                let inference = self.inferences[part][slot].as_ref();
+                let staleness_m = inference
+                    .map_or(f64::INFINITY, |inference| inference.staleness_m(&frames[part], reach_m, set.master_nanos));
                 found.push(Candidate { part, slot, crop, staleness_m });
             };
             for (side, model) in self.hands.iter().enumerate().filter(|_| self.config.fingers) {
@@ -318,8 +326,8 @@ impl HandTracker {
         (found, largest_px)
     }
 
-    /// Lets the networks look at the crops that need it most, within the budget. Returns the numbers of hands and faces.
-    fn look(
+    /// Runs the networks on the stalest crops within the budget. Returns the numbers of hands and faces.
+    fn infer(
         &mut self,
         set: &FrameSet,
         mut candidates: Vec<Candidate>,
@@ -331,15 +339,14 @@ impl HandTracker {
         if self.config.crops > 0 {
             candidates.truncate(self.config.crops);
         }
-        let seen: Vec<(usize, usize, PartLook)> = candidates
+        let seen: Vec<(usize, usize, PartInference)> = candidates
             .par_iter()
             .map(|&Candidate { part, slot, crop, .. }| {
                 let camera = &self.rig.cameras[slot];
                 let frame = set.frames[slot].as_ref().ok_or_else(|| {
                     TrackError::new(TrackErrorKind::Frames, format!("camera {} has no frame", camera.id))
                 })?;
-                check_size(camera, &frame.image)?;
-                let picture = Rgb::new(&frame.image)?;
+                let picture = Rgb::of_camera(&frame.image, camera)?;
                 let view = View::new(camera);
                 let (seen, presence) = if part == HEAD {
                     let output = self.face_net.run(&crop.sample_square(&picture, FACE_SIDE))?;
@@ -355,27 +362,28 @@ impl HandTracker {
                 let delay_secs = 1e-9 * frame.capture_nanos.saturating_sub(set.master_nanos) as f64;
                 let translation = frames[part].translation + velocity[part] * delay_secs.clamp(-0.1, 0.1);
                 let frame = RigidMotion { translation, ..frames[part] };
-                Ok((part, slot, PartLook { nanos: set.master_nanos, seen, presence, frame }))
+                Ok((part, slot, PartInference { nanos: set.master_nanos, seen, presence, frame }))
             })
             .collect::<Result<_, TrackError>>()?;
         let mut crops = [0; 2];
-        for (part, slot, look) in seen {
+        for (part, slot, inference) in seen {
             crops[usize::from(part == HEAD)] += 1;
-            self.looks[part][slot] = Some(look);
+            self.inferences[part][slot] = Some(inference);
         }
         Ok(crops)
     }
 
-    /// Looks of a part that may be used at a time.
-    fn usable(&self, part: usize, nanos: i64) -> impl Iterator<Item = (&Camera, &PartLook)> {
-        let looks = self.looks[part].iter().zip(&self.rig.cameras);
-        looks.filter_map(move |(look, camera)| {
-            let look = look.as_ref()?;
-            (look.presence >= MIN_PRESENCE && look.age_secs(nanos) < FORGET_SECS).then_some((camera, look))
+    /// Iterates over the usable inferences of a part at a time.
+    fn usable(&self, part: usize, nanos: i64) -> impl Iterator<Item = (&Camera, &PartInference)> {
+        let inferences = self.inferences[part].iter().zip(&self.rig.cameras);
+        inferences.filter_map(move |(inference, camera)| {
+            let inference = inference.as_ref()?;
+            (inference.presence >= MIN_PRESENCE && inference.age_secs(nanos) < FORGET_SECS)
+                .then_some((camera, inference))
         })
     }
 
-    /// Fits a hand to the looks at it; `None` leaves it relaxed.
+    /// Fits a hand to its inferences; `None` leaves it relaxed.
     fn fit_hand(
         &self,
         side: usize,
@@ -388,9 +396,9 @@ impl HandTracker {
             return None;
         }
         quality.state = HandState::NotSeen;
-        let sight = |(camera, look): (&Camera, &PartLook)| {
-            let seen = std::array::from_fn(|i| look.seen.get(i).copied().flatten());
-            HandSight { view: View::new(camera), seen, trust: look.trust(nanos), carry: look.carry(frame) }
+        let sight = |(camera, inference): (&Camera, &PartInference)| {
+            let seen = std::array::from_fn(|i| inference.seen.get(i).copied().flatten());
+            HandSight { sight: sight_of(camera, inference, frame, nanos), seen }
         };
         let mut sights: Vec<HandSight> = self.usable(side, nanos).map(sight).collect();
         if sights.is_empty() {
@@ -426,12 +434,12 @@ impl HandTracker {
         Some(pose)
     }
 
-    /// Fits the head to the looks at the face; `None` leaves it as it is.
+    /// Fits the head to the inferences of the face; `None` leaves it in the body's pose.
     fn fit_head(&self, frame: &RigidMotion, nanos: i64, quality: &mut HeadQuality) -> Option<DQuat> {
-        let sight = |(camera, look): (&Camera, &PartLook)| {
+        let sight = |(camera, inference): (&Camera, &PartInference)| {
             let points = FACE_POINTS.iter().map(|point| point.place_m(self.scale));
-            let seen = look.seen.iter().zip(points).filter_map(|(seen, point)| Some(((*seen)?, point))).collect();
-            FaceSight { view: View::new(camera), seen, trust: look.trust(nanos), carry: look.carry(frame) }
+            let seen = inference.seen.iter().zip(points).filter_map(|(seen, point)| Some(((*seen)?, point))).collect();
+            FaceSight { sight: sight_of(camera, inference, frame, nanos), seen }
         };
         let mut sights: Vec<FaceSight> =
             self.usable(HEAD, nanos).map(sight).filter(|sight| !sight.seen.is_empty()).collect();
@@ -457,12 +465,17 @@ impl HandTracker {
     }
 }
 
-/// The template with fingers.
+/// Returns the view of a part in the image of an inference.
+fn sight_of(camera: &Camera, inference: &PartInference, frame: &RigidMotion, nanos: i64) -> Sight {
+    Sight { view: View::new(camera), trust: inference.trust(nanos), carry: inference.carry(frame) }
+}
+
+/// Returns the template with fingers.
 fn fingered(template: &Template) -> Result<Template, TrackError> {
     template.with_fingers().map_err(|error| TrackError::new(TrackErrorKind::Template, error.to_string()))
 }
 
-/// Velocities of wrists and head since the last set, metres a second.
+/// Returns the velocities of wrists and head since the last frame set, metres per second.
 fn velocities(last: Option<&Last>, frames: &[RigidMotion; PARTS], nanos: i64) -> [DVec3; PARTS] {
     let Some(last) = last else { return [DVec3::ZERO; PARTS] };
     let secs = 1e-9 * nanos.saturating_sub(last.nanos) as f64;
@@ -475,7 +488,7 @@ fn velocities(last: Option<&Last>, frames: &[RigidMotion; PARTS], nanos: i64) ->
     })
 }
 
-/// Fingers that nobody sees, on their way to the relaxed hand.
+/// Returns unseen fingers on their way to the relaxed hand, `secs` after `before`.
 fn calmed(before: &Bends, secs: f64) -> Bends {
     let share = (secs / FORGET_SECS).clamp(0.0, 1.0);
     let calm = relaxed();
@@ -537,8 +550,8 @@ mod tests {
             let (_, quality) = tracker.estimate(&grey_set(&rig, k * 1_000_000), &pose).unwrap();
             assert_eq!(quality.crops, [2, 0]);
         }
-        assert!(tracker.looks[..2].iter().flatten().all(Option::is_some));
-        // Nothing has moved, and no look is old.
+        assert!(tracker.inferences[..2].iter().flatten().all(Option::is_some));
+        // No part has moved, and no inference is old.
         let (_, quality) = tracker.estimate(&grey_set(&rig, 4_000_000), &pose).unwrap();
         assert_eq!(quality.crops, [0, 0]);
     }

@@ -126,7 +126,7 @@ fn look_through(
     let mut tracks = PersonTracks::new(rig.cameras.len(), LANDMARKS.len());
     let secs = [args.from_secs, args.from_secs + args.secs];
     let errors = take::each_set(take.sources, rig, take.sync, 0, secs, "the person, ms of the take", |set| {
-        for (slot, found) in viewers.look(set)?.into_iter().enumerate() {
+        for (slot, found) in viewers.estimate(set)?.into_iter().enumerate() {
             let (Some(found), Some(frame)) = (found, &set.frames[slot]) else { continue };
             if let Some(mask) = found.masks.iter().flatten().next() {
                 let corner = |corner: HullCorner| OutlineCorner { ray: corner.ray, is_cut: corner.is_cut };

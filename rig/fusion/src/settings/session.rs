@@ -44,7 +44,6 @@ impl SessionSettings {
         self.perception.validate()?;
         self.body.validate()?;
         self.tracking.validate()?;
-        self.budget.validate()?;
-        self.appearance.validate()
+        self.budget.validate()
     }
 }

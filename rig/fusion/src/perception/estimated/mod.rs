@@ -248,7 +248,7 @@ impl Perception for EstimatedPerception {
         self.mattes = effort.mattes;
         for place in &mut self.places {
             let config = place.estimator.config_mut();
-            config.looks = effort.looks;
+            config.max_inferences = effort.looks;
             config.search_crops = effort.search_crops;
             config.outline_rounds = self.rounds.min(effort.rounds);
         }

@@ -145,5 +145,5 @@ fn count_stages(estimate: &PoseEstimate, stages: &mut StageTimes) {
     ] {
         stages.add(stage, Duration::from_secs_f64(seconds.max(0.0)));
     }
-    stages.count("views that the network looked at", estimate.quality.looked as u64);
+    stages.count("pose network inferences", estimate.quality.inferred as u64);
 }

@@ -1,0 +1,188 @@
+//! Rotated square crops of an image, the input of landmark networks.
+
+use glam::DVec2;
+
+use crate::image::pixels::Rgb;
+use crate::landmarks::keypoints::{
+    Keypoint, LANDMARK_COUNT, LEFT_HIP, LEFT_SHOULDER, RIGHT_HIP, RIGHT_SHOULDER, ViewKeypoints,
+};
+use crate::network::output::{NET_SIDE, NetOutput};
+
+/// Half side of a crop over the distance of the farthest landmark: the network was trained with a quarter more than the
+/// person.
+const MARGIN: f64 = 1.25;
+
+/// Square of an image, rotated so that the person stands upright in it.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub(crate) struct Crop {
+    /// Centre, pixels of the image.
+    pub center: DVec2,
+    /// Side, pixels of the image.
+    pub side: f64,
+    /// Direction of the crop's x axis in the image, a unit vector.
+    pub turn: DVec2,
+}
+
+impl Crop {
+    /// Returns an upright square.
+    pub fn upright(center: DVec2, side: f64) -> Self {
+        Self { center, side, turn: DVec2::X }
+    }
+
+    /// Returns the crop for a person's landmarks in image pixels: centred on the hips, shoulders above the hips, reaching a
+    /// quarter farther than the farthest landmark. `None` when the points do not span a person.
+    pub fn around(points: &[Option<DVec2>; LANDMARK_COUNT]) -> Option<Self> {
+        let middle = |a: usize, b: usize| Some((points[a]? + points[b]?) * 0.5);
+        let hips = middle(LEFT_HIP, RIGHT_HIP)?;
+        let shoulders = middle(LEFT_SHOULDER, RIGHT_SHOULDER)?;
+        let up = shoulders - hips;
+        let reach = points.iter().flatten().map(|p| (*p - hips).length()).fold(0.0, f64::max);
+        if !(reach.is_finite() && (8.0..1e5).contains(&reach)) {
+            return None;
+        }
+        // Seen from above or below the trunk has no direction in the image.
+        let turn = if up.length() < 0.08 * reach { DVec2::X } else { up.perp().normalize() };
+        Some(Self { center: hips, side: 2.0 * MARGIN * reach, turn })
+    }
+
+    /// Returns the size of a pixel of a crop of [`NET_SIDE`], pixels of the image.
+    pub fn scale(&self) -> f64 {
+        self.side / NET_SIDE as f64
+    }
+
+    /// Returns the image pixel of a pixel of a crop of [`NET_SIDE`] (pixel centres at integers in both).
+    pub fn to_image(self, crop_px: DVec2) -> DVec2 {
+        self.to_image_from(crop_px, NET_SIDE)
+    }
+
+    /// Returns the image pixel of a pixel of a crop of `net_side` pixels (pixel centres at integers in both).
+    pub fn to_image_from(self, crop_px: DVec2, net_side: usize) -> DVec2 {
+        let offset = (crop_px + 0.5 - 0.5 * net_side as f64) * (self.side / net_side as f64);
+        self.center + self.turn.rotate(offset)
+    }
+
+    /// Returns the pixel of a crop of [`NET_SIDE`] that an image pixel falls on.
+    pub fn crop_from_image(self, image_px: DVec2) -> DVec2 {
+        let offset = (self.turn * DVec2::new(1.0, -1.0)).rotate(image_px - self.center);
+        offset / self.scale() + 0.5 * NET_SIDE as f64 - 0.5
+    }
+
+    /// Samples a crop of [`NET_SIDE`]; see [`Self::sample_square`].
+    pub fn sample(&self, picture: &Rgb) -> Vec<f32> {
+        self.sample_square(picture, NET_SIDE)
+    }
+
+    /// Samples a crop of `net_side` x `net_side` pixels: RGB in 0..=1, row by row, black outside the image. Each value
+    /// averages enough samples that a large crop does not alias.
+    pub fn sample_square(&self, picture: &Rgb, net_side: usize) -> Vec<f32> {
+        let taps = ((self.side / net_side as f64).round() as usize).clamp(1, 4);
+        let mut rgb = Vec::with_capacity(net_side * net_side * 3);
+        let weight = 1.0 / (255.0 * (taps * taps) as f32);
+        let origin = self.to_image_from(DVec2::ZERO, net_side);
+        let (right, down) =
+            (self.to_image_from(DVec2::X, net_side) - origin, self.to_image_from(DVec2::Y, net_side) - origin);
+        for y in 0..net_side {
+            for x in 0..net_side {
+                let mut sum = [0.0f32; 3];
+                for ty in 0..taps {
+                    for tx in 0..taps {
+                        let tap = |t: usize| (t as f64 + 0.5) / taps as f64 - 0.5;
+                        let at = origin + right * (x as f64 + tap(tx)) + down * (y as f64 + tap(ty));
+                        let color = picture.bilinear(at);
+                        for (s, c) in sum.iter_mut().zip(color) {
+                            *s += c;
+                        }
+                    }
+                }
+                rgb.extend(sum.map(|s| s * weight));
+            }
+        }
+        rgb
+    }
+
+    /// Returns the network's landmarks in pixels of the image.
+    pub fn keypoints(&self, output: &NetOutput) -> ViewKeypoints {
+        std::array::from_fn(|i| {
+            let landmark = output.landmarks[i];
+            Keypoint { pixel: self.to_image(DVec2::new(landmark.x, landmark.y)), confidence: landmark.confidence }
+        })
+    }
+}
+
+/// Returns upright squares of three sizes that cover an image, the whole image first.
+pub(crate) fn search_crops(width: u32, height: u32) -> Vec<Crop> {
+    let (width, height) = (f64::from(width), f64::from(height));
+    let long = width.max(height);
+    let mut crops = Vec::new();
+    for fraction in [1.0, 0.66, 0.45] {
+        let side = long * fraction;
+        let centers = |length: f64| -> Vec<f64> {
+            if length <= side * 1.1 {
+                return vec![0.5 * length];
+            }
+            let count = ((length - side) / (0.5 * side)).ceil() as usize + 1;
+            (0..count).map(|i| 0.5 * side + (length - side) * i as f64 / (count - 1).max(1) as f64).collect()
+        };
+        for y in centers(height) {
+            for x in centers(width) {
+                crops.push(Crop::upright(DVec2::new(x, y), side));
+            }
+        }
+    }
+    crops
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_turned_crop_puts_the_shoulders_above_the_hips_and_maps_both_ways() {
+        let mut points = [None; LANDMARK_COUNT];
+        points[LEFT_HIP] = Some(DVec2::new(100.0, 100.0));
+        points[RIGHT_HIP] = Some(DVec2::new(100.0, 120.0));
+        points[LEFT_SHOULDER] = Some(DVec2::new(160.0, 100.0));
+        points[RIGHT_SHOULDER] = Some(DVec2::new(160.0, 120.0));
+        let crop = Crop::around(&points).unwrap();
+        let at = |i: usize| crop.crop_from_image(points[i].unwrap());
+        assert!(at(LEFT_SHOULDER).y < at(LEFT_HIP).y - 40.0);
+        assert!((at(LEFT_SHOULDER).x - at(LEFT_HIP).x).abs() < 1e-9);
+        let there = DVec2::new(31.0, 77.0);
+        assert!((crop.crop_from_image(crop.to_image(there)) - there).length() < 1e-9);
+        assert!((crop.to_image(DVec2::splat(127.5)) - crop.center).length() < 1e-9);
+    }
+
+    #[test]
+    fn points_that_span_nobody_have_no_crop() {
+        assert_eq!(Crop::around(&[None; LANDMARK_COUNT]), None);
+        assert_eq!(Crop::around(&[Some(DVec2::ONE); LANDMARK_COUNT]), None);
+        assert_eq!(Crop::around(&[Some(DVec2::NAN); LANDMARK_COUNT]), None);
+    }
+
+    #[test]
+    fn search_covers_every_image_shape() {
+        for (width, height) in [(1, 1), (540, 960), (4000, 300)] {
+            let crops = search_crops(width, height);
+            assert!((3..200).contains(&crops.len()));
+            for corner in [DVec2::ZERO, DVec2::new(f64::from(width), f64::from(height))] {
+                for size in [1.0, 0.66, 0.45] {
+                    let side = f64::from(width.max(height)) * size;
+                    let covered = crops.iter().filter(|c| (c.side - side).abs() < 1e-9);
+                    assert!(
+                        covered.clone().any(|c| (corner - c.center).abs().max_element() <= 0.56 * side),
+                        "{width}x{height} {side} {corner}"
+                    );
+                }
+            }
+        }
+    }
+
+    #[test]
+    fn a_crop_of_one_colour_is_that_colour_inside_and_black_outside() {
+        let picture = Rgb { width: 20, height: 20, bytes: vec![255; 20 * 20 * 3].into() };
+        let samples = Crop::upright(DVec2::new(0.0, 9.5), 20.0).sample(&picture);
+        let pixel = |x: usize, y: usize| samples[(y * NET_SIDE + x) * 3];
+        assert!((pixel(200, 128) - 1.0).abs() < 1e-6);
+        assert!(pixel(20, 128).abs() < 1e-6);
+    }
+}

@@ -1,0 +1,159 @@
+//! Masks from the network's coarse mask, sharpened on the image and gated by the fitted body.
+//!
+//! The probability is joined with a colour model of person and surroundings, evidence from the background where it is
+//! known, and the distance to the body, then smoothed along the image's edges by a guided filter (He et al. 2010).
+
+use flyrig_types::Mask;
+use glam::DVec2;
+use rayon::prelude::*;
+
+use crate::image::grid::{Grid, clean};
+use crate::image::pixels::Rgb;
+use crate::landmarks::sighting::Sighting;
+use crate::masks::gate::BodyGate;
+use crate::masks::plate_evidence::NO_EVIDENCE;
+use crate::network::output::NET_SIDE;
+
+/// Twice the log-odds of a pixel that surely differs from the plate, and of one that surely matches it.
+const DIFFERENT_LOGIT: f32 = 10.0;
+const PLATE_LOGIT: f32 = 6.0;
+/// Bins per channel of the colour model.
+const BINS: usize = 16;
+
+/// Distance from the body at which a mask from the body alone ends, and width of its fade, in the gate's unit.
+const CLOTHES: f32 = 0.2;
+const FADE: f32 = 0.1;
+
+/// Returns the network's probability of a person inside the gate's bounds, or one from the body alone where the network has
+/// no mask.
+pub(crate) fn coarse_mask(sighting: &Sighting, gate: &BodyGate) -> Grid {
+    let [x0, y0, x1, y1] = gate.bounds;
+    let Some(mask) = &sighting.output.mask else { return body_mask(gate) };
+    let mut coarse = Grid::new(x1 - x0, y1 - y0, 0.0);
+    coarse.rows_mut().for_each(|(y, row)| {
+        for (x, value) in row.iter_mut().enumerate() {
+            let pixel = DVec2::new((x + x0) as f64, (y + y0) as f64);
+            *value = net_probability(mask, sighting.crop.crop_from_image(pixel));
+        }
+    });
+    coarse
+}
+
+/// Returns a probability from the distance to the body alone.
+fn body_mask(gate: &BodyGate) -> Grid {
+    let mut coarse = gate.distance.clone();
+    coarse.values.iter_mut().for_each(|distance| *distance = 1.0 / (1.0 + ((*distance - CLOTHES) / FADE).exp()));
+    coarse
+}
+
+/// Returns the person's mask at the image's size; `None` when it is empty.
+///
+/// `coarse` is the network's probability inside the gate's bounds and `crop_scale` the size of one of its pixels in pixels
+/// of the image. The colour model consists of histograms of this image's own sure regions. Evidence from the background,
+/// inside the gate's bounds, finds thin parts that the coarse mask misses, and the coarse mask finds parts of the
+/// background's colour.
+pub(crate) fn refine(
+    picture: &Rgb,
+    coarse: &Grid,
+    crop_scale: f64,
+    gate: &BodyGate,
+    plate_evidence: Option<&Grid>,
+) -> Option<Mask> {
+    let [x0, y0, x1, y1] = gate.bounds;
+    let (width, height) = (x1 - x0, y1 - y0);
+    let bin = |x: usize, y: usize| -> usize {
+        let [r, g, b] = picture.pixel(x + x0, y + y0).map(|c| usize::from(c) * BINS / 256);
+        (r * BINS + g) * BINS + b
+    };
+    let mut inside = vec![0.05f32; BINS * BINS * BINS];
+    let mut outside = inside.clone();
+    let (mut inside_total, mut outside_total) = (0.0f32, 0.0f32);
+    for y in 0..height {
+        for x in 0..width {
+            let at = y * width + x;
+            let (p, d) = (coarse.values[at], gate.distance.values[at]);
+            if p > 0.8 && d < 0.4 {
+                inside[bin(x, y)] += 1.0;
+                inside_total += 1.0;
+            } else if p < 0.2 && d > 0.15 {
+                outside[bin(x, y)] += 1.0;
+                outside_total += 1.0;
+            }
+        }
+    }
+    // Once per bin: pixels outnumber bins.
+    let speaks = inside_total > 50.0 && outside_total > 50.0;
+    let color_logit = |bin: usize| {
+        let (i, o) = (smooth(&inside, bin) / inside_total, smooth(&outside, bin) / outside_total);
+        ((i + 1e-5) / (o + 1e-5)).ln().clamp(-2.5, 2.5)
+    };
+    let color_logits: Vec<f32> = (0..inside.len())
+        .into_par_iter()
+        .with_min_len(512)
+        .map(|bin| if speaks { color_logit(bin) } else { 0.0 })
+        .collect();
+    let mut probability = coarse.clone();
+    probability.rows_mut().for_each(|(y, row)| {
+        for (x, probability) in row.iter_mut().enumerate() {
+            let at = y * width + x;
+            let (p, d) = (coarse.values[at].clamp(0.02, 0.98), gate.distance.values[at]);
+            if d >= gate.reach {
+                *probability = 0.0;
+                continue;
+            }
+            let color = color_logits[bin(x, y)];
+            let near = 1.0 - 4.0 * d.min(1.0);
+            let evidence = plate_evidence.map_or(NO_EVIDENCE, |e| e.values[at]) - NO_EVIDENCE;
+            let plate = evidence * if evidence > 0.0 { DIFFERENT_LOGIT } else { PLATE_LOGIT };
+            // The plate knows better how the surroundings look at this pixel: shoes of the floor's colour are no floor.
+            let color = if evidence == 0.0 { color } else { color.max(0.0) };
+            let logit = (p / (1.0 - p)).ln() + 0.6 * color + near + plate;
+            *probability = 1.0 / (1.0 + (-logit).exp());
+        }
+    });
+    let mut guide = Grid::new(width, height, 0.0);
+    guide.rows_mut().for_each(|(y, row)| {
+        for (x, guide) in row.iter_mut().enumerate() {
+            let [r, g, b] = picture.pixel(x + x0, y + y0).map(f32::from);
+            *guide = (0.3 * r + 0.55 * g + 0.15 * b) / 255.0;
+        }
+    });
+    let radius = (1.5 * crop_scale).round().clamp(2.0, 12.0) as usize;
+    let mut smoothed = probability.guided(&guide, radius, 1e-3);
+    for (value, d) in smoothed.values.iter_mut().zip(&gate.distance.values) {
+        // A soft step around one half keeps about a pixel of slope.
+        *value = if *d >= gate.reach { 0.0 } else { ((*value - 0.5) * 3.0 + 0.5).clamp(0.0, 1.0) };
+    }
+    clean(&mut smoothed, (0.02 * gate.px_per_m).round() as usize);
+    smoothed.paste(picture.width, picture.height, x0, y0)
+}
+
+/// Returns a bin's count and a share of its neighbours' counts.
+fn smooth(histogram: &[f32], bin: usize) -> f32 {
+    let mut sum = histogram[bin];
+    for (step, limit) in [(1, BINS), (BINS, BINS * BINS), (BINS * BINS, BINS * BINS * BINS)] {
+        let place = bin % limit / step;
+        if place > 0 {
+            sum += 0.3 * histogram[bin - step];
+        }
+        if place + 1 < BINS {
+            sum += 0.3 * histogram[bin + step];
+        }
+    }
+    sum
+}
+
+/// Samples the network's mask bilinearly at a pixel of the crop; 0 outside.
+pub(crate) fn net_probability(mask: &[f32], at: DVec2) -> f32 {
+    let limit = NET_SIDE as f64 - 1.0;
+    if !(at.x >= 0.0 && at.y >= 0.0 && at.x <= limit && at.y <= limit) {
+        return 0.0;
+    }
+    let (x, y) = (at.x as usize, at.y as usize);
+    let (x1, y1) = ((x + 1).min(NET_SIDE - 1), (y + 1).min(NET_SIDE - 1));
+    let (fx, fy) = ((at.x - x as f64) as f32, (at.y - y as f64) as f32);
+    let value = |x: usize, y: usize| mask[y * NET_SIDE + x];
+    let top = value(x, y) + (value(x1, y) - value(x, y)) * fx;
+    let bottom = value(x, y1) + (value(x1, y1) - value(x, y1)) * fx;
+    top + (bottom - top) * fy
+}

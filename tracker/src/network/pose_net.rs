@@ -1,0 +1,152 @@
+//! The pose network: BlazePose (Bazarevsky et al. 2020), or one of the user's choice.
+
+use std::path::Path;
+
+use crate::error::TrackError;
+use crate::image::crop::Crop;
+use crate::image::pixels::Rgb;
+use crate::landmarks::keypoints::LANDMARK_COUNT;
+use crate::network::chosen_net::ChosenNet;
+use crate::network::landmark_net::{LandmarkNet, sigmoid};
+use crate::network::output::{CropLandmark, NET_SIDE, NetOutput};
+
+/// Floats per landmark in BlazePose's output.
+const LANDMARK_STRIDE: usize = 5;
+/// Landmarks of BlazePose: 33 of the body, and 6 helpers of the original's tracking that are not used.
+const NET_LANDMARKS: usize = 39;
+
+static EMBEDDED: &[u8] = include_bytes!("../../assets/pose_full.onnx");
+
+/// Network that finds a person's landmarks: the one built in (BlazePose full; licence beside the file in `assets`), or one
+/// of the user's choice.
+#[derive(Clone)]
+pub struct PoseNet {
+    kind: Kind,
+}
+
+#[derive(Clone)]
+enum Kind {
+    BlazePose(LandmarkNet),
+    Chosen(Box<ChosenNet>),
+}
+
+impl std::fmt::Debug for PoseNet {
+    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+        f.write_str("PoseNet")
+    }
+}
+
+impl PoseNet {
+    /// Loads the network built into this crate. Takes a few hundred milliseconds; clone it instead of loading it twice.
+    ///
+    /// # Errors
+    /// Kind [`crate::TrackErrorKind::Net`] when the file does not load.
+    pub fn embedded() -> Result<Self, TrackError> {
+        Self::from_onnx(EMBEDDED)
+    }
+
+    /// Loads a network from the bytes of an ONNX file with BlazePose's outputs, which are identified by their sizes.
+    ///
+    /// # Errors
+    /// Kind [`crate::TrackErrorKind::Net`] when the file does not load or has other inputs or outputs.
+    pub fn from_onnx(bytes: &[u8]) -> Result<Self, TrackError> {
+        let net = LandmarkNet::load(bytes, NET_SIDE, "pose")?;
+        run_blazepose(&net, &net.blank())?;
+        Ok(Self { kind: Kind::BlazePose(net) })
+    }
+
+    /// Loads a network of the user's choice from a TOML file that describes it (docs/guide/people.md).
+    ///
+    /// # Errors
+    /// Kind [`crate::TrackErrorKind::Net`] names the file, and the key where one is wrong.
+    pub fn from_description(path: &Path) -> Result<Self, TrackError> {
+        Ok(Self { kind: Kind::Chosen(Box::new(ChosenNet::read(path)?)) })
+    }
+
+    /// Whether outputs hold a mask and the depth of landmarks.
+    #[must_use]
+    pub fn sees_depth(&self) -> bool {
+        matches!(self.kind, Kind::BlazePose(_))
+    }
+
+    /// Runs the network on a square of an image.
+    ///
+    /// # Errors
+    /// Kind [`crate::TrackErrorKind::Net`] when the network fails, or an output is missing or not finite.
+    pub(crate) fn infer(&self, picture: &Rgb, crop: Crop) -> Result<NetOutput, TrackError> {
+        match &self.kind {
+            Kind::BlazePose(net) => run_blazepose(net, &crop.sample(picture)),
+            Kind::Chosen(net) => net.infer(picture, crop),
+        }
+    }
+}
+
+/// Runs BlazePose on a crop of 256 x 256 x 3 values, RGB in 0..=1, row by row.
+fn run_blazepose(net: &LandmarkNet, rgb: &[f32]) -> Result<NetOutput, TrackError> {
+    let outputs = net.run(rgb)?;
+    let find = |count| outputs.of_size(count);
+    let raw = find(NET_LANDMARKS * LANDMARK_STRIDE)?;
+    let world = find(NET_LANDMARKS * 3)?;
+    let presence = f64::from(find(1)?[0]).clamp(0.0, 1.0);
+    let mask = find(NET_SIDE * NET_SIDE)?.into_iter().map(|logit| 1.0 / (1.0 + (-logit).exp())).collect();
+    let mut landmarks = [CropLandmark::default(); LANDMARK_COUNT];
+    for (i, landmark) in landmarks.iter_mut().enumerate() {
+        let [x, y, _, visible, present] = std::array::from_fn(|k| f64::from(raw[i * LANDMARK_STRIDE + k]));
+        *landmark = CropLandmark {
+            // The network's coordinates have pixel corners at integers.
+            x: x - 0.5,
+            y: y - 0.5,
+            confidence: sigmoid(visible).min(sigmoid(present)),
+            world: Some(std::array::from_fn(|k| f64::from(world[i * 3 + k]))),
+        };
+    }
+    Ok(NetOutput { landmarks, presence, mask: Some(mask) })
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::error::TrackErrorKind;
+
+    fn grey() -> Rgb<'static> {
+        Rgb { width: NET_SIDE, height: NET_SIDE, bytes: vec![128; NET_SIDE * NET_SIDE * 3].into() }
+    }
+
+    fn whole() -> Crop {
+        Crop::upright(glam::DVec2::splat(0.5 * NET_SIDE as f64 - 0.5), NET_SIDE as f64)
+    }
+
+    #[test]
+    fn the_embedded_network_sees_nobody_in_grey_and_refuses_a_wrong_size() {
+        let net = PoseNet::embedded().unwrap();
+        let output = net.infer(&grey(), whole()).unwrap();
+        assert!(output.presence < 0.5, "presence {}", output.presence);
+        let mask = output.mask.unwrap();
+        assert_eq!(mask.len(), NET_SIDE * NET_SIDE);
+        assert!(mask.iter().all(|p| (0.0..=1.0).contains(p)));
+        let Kind::BlazePose(net) = net.kind else { panic!("the embedded network is BlazePose") };
+        assert_eq!(run_blazepose(&net, &[0.5; 12]).unwrap_err().kind, TrackErrorKind::Net);
+    }
+
+    #[test]
+    fn runs_from_many_threads_and_from_rayons_own_do_not_meet() {
+        use rayon::prelude::*;
+        let net = PoseNet::embedded().unwrap();
+        let run = |_| net.infer(&grey(), whole()).unwrap().presence.to_bits();
+        let expected = run(0);
+        std::thread::scope(|scope| {
+            for thread in 0..4 {
+                scope.spawn(move || match thread % 2 {
+                    0 => (0..8).into_par_iter().for_each(|i| assert_eq!(run(i), expected)),
+                    _ => (0..8).for_each(|i| assert_eq!(run(i), expected)),
+                });
+            }
+        });
+    }
+
+    #[test]
+    fn a_damaged_file_is_an_error() {
+        assert_eq!(PoseNet::from_onnx(b"not an ONNX file").unwrap_err().kind, TrackErrorKind::Net);
+        assert_eq!(PoseNet::from_onnx(&EMBEDDED[..EMBEDDED.len() / 2]).unwrap_err().kind, TrackErrorKind::Net);
+    }
+}
