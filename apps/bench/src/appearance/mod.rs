@@ -5,14 +5,21 @@ use std::{
     path::{Path, PathBuf},
 };
 
+use crate::harness::{
+    arguments::SimulationArgs,
+    sequence::{Motion, Sequence, SequenceConfig},
+};
 use anyhow::{Context, Result};
 use clap::ValueEnum as _;
+use clap::{Args, builder::TypedValueParser as _};
 use flyrig_fusion::{
-    AppearanceMode, AppearanceOptions, BodySettings, GivenPerception, PersonId, SessionBuilder, SessionSettings,
+    AppearanceMode, AppearanceOptions, BodySettings, GivenPerception, NetworksOn, PersonId, SessionBuilder,
+    SessionSettings,
 };
 use flyrig_gpu::GpuContext;
 use flyrig_metrics::{ScoreSheet, score_view};
 use flyrig_renderer::srgb_from_linear;
+use flyrig_report::arguments::{GaussiansArgs, OutputArgs};
 use flyrig_report::{
     plot::{Line, Plot, Series},
     progress_bar, write_whole,
@@ -20,10 +27,35 @@ use flyrig_report::{
 use flyrig_stfa::EMBEDDED;
 use serde::Serialize;
 
-use crate::{
-    cli::BenchAppearanceArgs,
-    sequence::{Motion, Sequence, SequenceConfig},
-};
+/// Arguments of the command.
+#[derive(Debug, Args)]
+#[command(mut_arg("out", |arg| arg.default_value("out/bench-appearance")), mut_arg("seed", |arg| arg.default_value("101")))]
+pub struct BenchAppearanceArgs {
+    /// How many people.
+    #[arg(long, default_value_t = 4, value_parser = clap::value_parser!(u64).range(1..=1000))]
+    pub people: u64,
+    /// Frames of each sequence; the second half is scored.
+    #[arg(long, default_value_t = 10, value_parser = clap::value_parser!(u16).range(2..=1000).map(usize::from))]
+    pub frames: usize,
+    /// Numbers of input cameras, comma separated.
+    #[arg(long, value_delimiter = ',', default_value = "3,1", value_parser = clap::value_parser!(u8).range(1..=6).map(usize::from))]
+    pub views: Vec<usize>,
+    /// Weights files of the learned modes, in place of all networks that come with flyrig; may be given several times.
+    #[arg(long)]
+    pub weights: Vec<PathBuf>,
+    /// Reuse of the networks' results from frame to frame: see `reuse` in the configuration.
+    #[arg(long, default_value_t = 0.0)]
+    pub reuse: f32,
+    /// Where the networks run; "adapter" needs a program that was built with the feature gpu-networks.
+    #[arg(long, value_enum, default_value = "processor")]
+    pub networks_on: NetworksOn,
+    #[command(flatten)]
+    pub output: OutputArgs,
+    #[command(flatten)]
+    pub simulation: SimulationArgs,
+    #[command(flatten)]
+    pub surface: GaussiansArgs,
+}
 
 /// What came out for one person, one number of views and one mode.
 #[derive(Debug, Clone, Serialize)]
@@ -43,7 +75,7 @@ struct Row {
 
 /// Runs the command.
 pub fn appearance(args: &BenchAppearanceArgs, gpu: &GpuContext) -> Result<()> {
-    std::fs::create_dir_all(&args.out).with_context(|| format!("cannot create {}", args.out.display()))?;
+    args.output.create()?;
     let networks = networks(&args.weights);
     let modes: Vec<Mode<'_>> = AppearanceMode::value_variants()
         .iter()
@@ -55,16 +87,21 @@ pub fn appearance(args: &BenchAppearanceArgs, gpu: &GpuContext) -> Result<()> {
         .collect();
     let bar = progress_bar(args.people * (args.views.len() * modes.len()) as u64, "bench appearance");
     let mut rows = Vec::new();
-    for person in args.seed..args.seed.saturating_add(args.people) {
-        let config =
-            SequenceConfig { motion: Motion::Turn, seed: person, side: args.side, frames: args.frames, fps: 30.0 };
+    for person in args.simulation.seed..args.simulation.seed.saturating_add(args.people) {
+        let config = SequenceConfig {
+            motion: Motion::Turn,
+            seed: person,
+            side: args.simulation.side,
+            frames: args.frames,
+            fps: 30.0,
+        };
         let sequence = Sequence::simulate(gpu, config)?;
         for &views in &args.views {
             for mode in &modes {
                 let row = run(gpu, args, &sequence, person, views, mode)?;
                 bar.set_message(format!("{} views, {}: {:.2} dB", row.views, row.mode, row.psnr_db));
                 rows.push(row);
-                write(&args.out, &rows)?;
+                write(&args.output.out, &rows)?;
                 bar.inc(1);
             }
         }
@@ -74,7 +111,7 @@ pub fn appearance(args: &BenchAppearanceArgs, gpu: &GpuContext) -> Result<()> {
     println!(
         "\n{}; appearance.csv, appearance.json and appearance.svg in {}",
         gpu.fastest().adapter_name(),
-        args.out.display()
+        args.output.out.display()
     );
     Ok(())
 }
@@ -95,7 +132,7 @@ fn run(
         reuse: args.reuse,
         networks_on: args.networks_on,
     };
-    let body = BodySettings::with_gaussians(args.gaussians);
+    let body = BodySettings::with_gaussians(args.surface.gaussians);
     let settings = SessionSettings { body, appearance, ..SessionSettings::default() };
     let mut session = SessionBuilder::new(gpu.clone(), rig).settings(settings).perception(perception).build()?;
     let mut sheet = ScoreSheet::default();

@@ -1,18 +1,26 @@
 //! `flyrig-bench avatar`: error of avatars against the time of their fit, and time and memory by their number of Gaussians.
 
+mod detail;
+mod variant;
+
 use std::{
     fmt::Write as _,
     ops::Range,
     time::{Duration, Instant},
 };
 
+use crate::harness::{arguments::ReplayArgs, images::copy, statistics::exponent};
 use anyhow::{Context, Result};
+use clap::{Args, builder::TypedValueParser as _};
+use detail::{SmallViews, small_views};
 use flyrig_avatar::{Avatar, AvatarScene, Bones, Fit, FitSettings};
 use flyrig_body::DEFAULT_GAUSSIAN_COUNT;
+use flyrig_fusion::Origin;
 use flyrig_fusion::{BudgetSettings, Outcome, PersonId, Solver, resident_mib};
 use flyrig_gpu::GpuContext;
 use flyrig_metrics::{CameraScore, ScoreSheet, score_view};
 use flyrig_renderer::HarmonicOrder;
+use flyrig_report::arguments::{OutputArgs, parse_range, parse_seconds};
 use flyrig_report::{
     AvatarTake, Replay, ReplaySettings, frame_number,
     plot::{Line, Plot, Series},
@@ -21,12 +29,47 @@ use flyrig_report::{
 use flyrig_types::{Camera, FrameSet, Image, Mask, Pose, RenderedView};
 use glam::DVec3;
 use serde::Serialize;
+use std::path::PathBuf;
+use variant::Variant;
 
-use crate::{
-    avatar_detail::{self, SmallViews, small_views},
-    cli::BenchAvatarArgs,
-    scale::exponent,
-};
+/// Arguments of the command.
+#[derive(Debug, Args)]
+#[command(mut_arg("out", |arg| arg.default_value("out/bench-avatar")))]
+pub struct BenchAvatarArgs {
+    /// Data set in EasyMocap layout, as `flyrig eval` and `flyrig sim export` know it.
+    pub dataset: PathBuf,
+    #[command(flatten)]
+    pub replay: ReplayArgs,
+    /// Frames of poses that avatars are not fitted to; they are fitted to --frames, the first 30 without it.
+    #[arg(long, default_value = "30..60", value_parser = parse_range)]
+    pub novel: Range<u64>,
+    /// Frames from one that is scored to the next.
+    #[arg(long, default_value_t = 5, value_parser = clap::value_parser!(u32).range(1..=1000))]
+    pub every: u32,
+    /// Where pose and masks come from.
+    #[arg(long, value_enum, default_value = "given")]
+    pub pose: Origin,
+    /// Numbers of Gaussians, comma separated.
+    #[arg(long, value_delimiter = ',', default_value = "10000,41000,164000", value_parser = clap::value_parser!(u32).range(1000..=1_000_000).map(|n| n as usize))]
+    pub gaussians: Vec<usize>,
+    /// Seconds of fitting after which the avatars are scored, comma separated; the largest ends the fit.
+    #[arg(long, value_delimiter = ',', default_value = "5,15,30,60,120", value_parser = parse_seconds)]
+    pub seconds: Vec<f64>,
+    /// Steps of fitting after which the avatars are scored, in place of seconds: the same steps give the same avatar.
+    #[arg(long, value_delimiter = ',', conflicts_with = "seconds", value_parser = clap::value_parser!(u64).range(1..=1_000_000))]
+    pub steps: Vec<u64>,
+    /// Rows of the ablation tables (docs/benchmarks/avatar.md), comma separated.
+    #[arg(long, value_enum, value_delimiter = ',', default_value = "direct")]
+    pub variant: Vec<Variant>,
+    /// As in `flyrig avatar build`.
+    #[arg(long, default_value_t = 5.0)]
+    pub pull: f32,
+    #[command(flatten)]
+    pub output: OutputArgs,
+}
+
+/// Name of the person as it is rendered live, in the table of costs.
+const LIVE: &str = "live";
 
 /// Images of the held-out cameras at one instant, and the person then.
 struct Held {
@@ -39,6 +82,7 @@ struct Held {
 /// Scores after some time of fitting.
 #[derive(Debug, Serialize)]
 struct Row {
+    variant: String,
     gaussians: usize,
     /// Seconds of fitting, without tracking and scoring, and steps.
     seconds: f64,
@@ -71,7 +115,7 @@ struct Cost {
 
 /// Runs the command.
 pub fn avatar(args: &BenchAvatarArgs, gpu: &GpuContext) -> Result<()> {
-    std::fs::create_dir_all(&args.out).with_context(|| format!("cannot create {}", args.out.display()))?;
+    args.output.create()?;
     let gpu = &gpu.fastest();
     let settings = |gaussians: usize, frames: &Range<u64>| {
         let mut settings = args.replay.settings(&args.dataset, args.pose, gaussians, BudgetSettings::default());
@@ -86,27 +130,30 @@ pub fn avatar(args: &BenchAvatarArgs, gpu: &GpuContext) -> Result<()> {
             break;
         }
         let training = settings(gaussians, &fitted);
-        let (take, held, cameras, track_secs) = track(args, &training, gpu)?;
-        if others.is_none() {
-            let mut settings = settings(gaussians, &args.novel);
-            settings.session.tracking.solver = Solver::None;
-            settings.body = Some(take.avatar.template.clone().into());
-            others = Some(track(args, &settings, gpu)?.1);
+        for &variant in &args.variant {
+            // Tracking is deterministic: every variant is fitted to the same poses.
+            let (take, held, cameras, track_secs) = track(args, &training, gpu)?;
+            if others.is_none() {
+                let mut settings = settings(gaussians, &args.novel);
+                settings.session.tracking.solver = Solver::None;
+                settings.body = Some(take.avatar.template.clone().into());
+                others = Some(track(args, &settings, gpu)?.1);
+            }
+            let novel = others.as_deref().unwrap_or_default();
+            costs.push(fit(args, gpu, take, (&held, novel, &cameras), track_secs, variant, &mut rows)?);
+            write(args, &rows, &costs)?;
         }
-        let novel = others.as_deref().unwrap_or_default();
-        costs.push(fit(args, gpu, take, (&held, novel, &cameras), track_secs, &mut rows)?);
-        write(args, &rows, &costs)?;
     }
     print!("{}", table(&rows, &costs));
-    println!("{}; avatar.md, .json and .svg in {}", gpu.adapter_name(), args.out.display());
+    println!("{}; avatar.md, .json and .svg in {}", gpu.adapter_name(), args.output.out.display());
     Ok(())
 }
 
 fn write(args: &BenchAvatarArgs, rows: &[Row], costs: &[Cost]) -> Result<()> {
-    write_whole(&args.out.join("avatar.md"), table(rows, costs).as_bytes())?;
+    write_whole(&args.output.out.join("avatar.md"), table(rows, costs).as_bytes())?;
     let all = serde_json::json!({ "scores": rows, "costs": costs });
-    write_whole(&args.out.join("avatar.json"), &serde_json::to_vec_pretty(&all)?)?;
-    write_whole(&args.out.join("avatar.svg"), plot(rows).svg().as_bytes())
+    write_whole(&args.output.out.join("avatar.json"), &serde_json::to_vec_pretty(&all)?)?;
+    write_whole(&args.output.out.join("avatar.svg"), plot(rows).svg().as_bytes())
 }
 
 /// Scores the person as it is drawn live.
@@ -133,7 +180,7 @@ fn live(args: &BenchAvatarArgs, settings: &ReplaySettings, gpu: &GpuContext) -> 
     }
     let score = sheet.mean().context("nothing to compare: give --holdout")?;
     Ok(Cost {
-        name: "live".to_owned(),
+        name: LIVE.to_owned(),
         gaussians: settings.session.body.gaussians,
         track_secs: started.elapsed().as_secs_f64(),
         step_ms: f64::NAN,
@@ -173,7 +220,6 @@ fn hold(replay: &mut Replay, set: &FrameSet) -> Result<Option<Held>> {
     let translations = subject.node_translations().to_vec();
     let truths = replay.truth.at(set.master_nanos)?;
     // The frame's own image is read anew with the next set.
-    let copy = |image: &Image| Image::new(image.width(), image.height(), image.format(), image.bytes().to_vec());
     let truths = truths
         .into_iter()
         .map(|truth| truth.map(|frame| Ok((copy(&frame.image)?, frame.mask.clone()))).transpose())
@@ -230,35 +276,47 @@ fn fit(
     take: AvatarTake,
     (held, novel, cameras): (&[Held], &[Held], &[Camera]),
     track_secs: f64,
+    variant: Variant,
     rows: &mut Vec<Row>,
 ) -> Result<Cost> {
-    let AvatarTake { frames, views, mut avatar, .. } = take;
+    let AvatarTake { frames, views, mut avatar, uvs, .. } = take;
     let gaussians = avatar.gaussians();
     let mut scene = AvatarScene::new(gpu, &avatar)?;
-    let mut fit = Fit::new(gpu, &avatar, frames, views, FitSettings { pull: args.pull, ..FitSettings::default() })?;
-    let end = args.seconds.iter().copied().fold(0.0, f64::max);
+    let settings = variant.fit_settings(FitSettings { pull: args.pull, ..FitSettings::default() });
+    let mut fit = Fit::new(gpu, &avatar, frames, views, settings)?;
+    if let Some(local) = variant.local_settings() {
+        fit.use_networks(&mut avatar, &uvs, &local)?;
+    }
+    let by_steps = !args.steps.is_empty();
+    let ends: Vec<f64> =
+        if by_steps { args.steps.iter().map(|&steps| steps as f64).collect() } else { args.seconds.clone() };
+    let end = ends.iter().copied().fold(0.0, f64::max);
     let bar = progress_bar(end as u64, "bench avatar");
     let (mut spent, mut steps) = (0.0, 0u64);
     let (mut times, mut psnr_db) = ([f64::NAN; 2], f64::NAN);
-    for wanted in std::iter::once(0.0).chain(args.seconds.iter().copied()) {
-        while spent < wanted && !stop::requested() {
+    for wanted in std::iter::once(0.0).chain(ends) {
+        loop {
+            let done = if by_steps { steps as f64 } else { spent };
+            if done >= wanted || stop::requested() {
+                break;
+            }
             let start = Instant::now();
-            fit.step(&mut avatar, (spent / end) as f32)?;
+            fit.step(&mut avatar, (done / end) as f32)?;
             spent += start.elapsed().as_secs_f64();
             steps += 1;
-            bar.set_position(spent as u64);
+            bar.set_position(done as u64);
         }
         let view = scored((&avatar, &mut scene), held, cameras, true)?;
         let (pose, _) = scored((&avatar, &mut scene), novel, cameras, false)?;
-        bar.set_message(format!("{gaussians}: {:.2} and {:.2} dB", view.0.psnr_db, pose.psnr_db));
+        bar.set_message(format!("{} {gaussians}: {:.2} and {:.2} dB", variant.name(), view.0.psnr_db, pose.psnr_db));
         (times, psnr_db) = (view.1, view.0.psnr_db);
-        rows.push(Row { gaussians, seconds: spent, steps, view: view.0, pose });
+        rows.push(Row { variant: variant.name(), gaussians, seconds: spent, steps, view: view.0, pose });
     }
     bar.finish_and_clear();
     let poses: Vec<_> = held.iter().map(|held| (&held.pose, held.translations.as_slice())).collect();
     let small = small_views(gpu, &avatar, &poses, cameras)?;
     Ok(Cost {
-        name: "avatar".to_owned(),
+        name: variant.name(),
         gaussians,
         track_secs,
         step_ms: 1e3 * spent / steps.max(1) as f64,
@@ -273,15 +331,15 @@ fn fit(
 
 fn table(rows: &[Row], costs: &[Cost]) -> String {
     let mut text = String::from(
-        "| Gaussians | seconds of fitting | steps | novel view: PSNR dB | SSIM | FLIP | IoU | novel pose: PSNR dB | SSIM | FLIP | IoU |\n\
-         |---|---|---|---|---|---|---|---|---|---|---|\n",
+        "| variant | Gaussians | seconds of fitting | steps | novel view: PSNR dB | SSIM | FLIP | IoU | novel pose: PSNR dB | SSIM | FLIP | IoU |\n\
+         |---|---|---|---|---|---|---|---|---|---|---|---|\n",
     );
     let of = |score: &CameraScore| {
         let CameraScore { psnr_db, ssim, flip, iou, .. } = score;
         format!("{psnr_db:.2} | {ssim:.4} | {flip:.4} | {:.4}", iou.unwrap_or(f64::NAN))
     };
-    for Row { gaussians, seconds, steps, view, pose } in rows {
-        let _ = writeln!(text, "| {gaussians} | {seconds:.0} | {steps} | {} | {} |", of(view), of(pose));
+    for Row { variant, gaussians, seconds, steps, view, pose } in rows {
+        let _ = writeln!(text, "| {variant} | {gaussians} | {seconds:.0} | {steps} | {} | {} |", of(view), of(pose));
     }
     text += "\n| drawn | Gaussians | tracking s | ms a step | posing ms | a view ms | file MB | resident MiB | novel view dB |\n|---|---|---|---|---|---|---|---|---|\n";
     let number =
@@ -301,11 +359,18 @@ fn table(rows: &[Row], costs: &[Cost]) -> String {
             cost.psnr_db,
         );
     }
-    let avatars: Vec<&Cost> = costs.iter().filter(|cost| cost.name == "avatar").collect();
+    let avatars: Vec<&Cost> = costs.iter().filter(|cost| cost.name != LIVE).collect();
     for avatar in &avatars {
-        let _ = write!(text, "\nThe {} in small images:\n\n{}", avatar.gaussians, avatar_detail::table(&avatar.small));
+        let _ = write!(
+            text,
+            "\n{}, {} Gaussians, in small images:\n\n{}",
+            avatar.name,
+            avatar.gaussians,
+            detail::table(&avatar.small)
+        );
     }
-    if avatars.len() > 1 {
+    let is_one_variant = avatars.windows(2).all(|pair| pair[0].name == pair[1].name);
+    if avatars.len() > 1 && is_one_variant {
         let power = |value: fn(&Cost) -> f64| {
             exponent(&avatars.iter().map(|cost| (cost.gaussians as f64, value(cost))).collect::<Vec<_>>())
         };
@@ -327,7 +392,7 @@ fn plot(rows: &[Row]) -> Plot {
     let mut series: Vec<Series> = Vec::new();
     for row in rows.iter().filter(|row| row.steps > 0) {
         for (what, score) in [("novel view", &row.view), ("novel pose", &row.pose)] {
-            let name = format!("{} Gaussians, {what}", row.gaussians);
+            let name = format!("{}, {} Gaussians, {what}", row.variant, row.gaussians);
             let point = (row.seconds, score.psnr_db, String::new());
             match series.iter_mut().find(|series| series.name == name) {
                 Some(series) => series.points.push(point),

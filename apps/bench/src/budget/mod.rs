@@ -2,18 +2,40 @@
 
 use std::{fmt::Write as _, time::Instant};
 
+use crate::harness::arguments::ReplayArgs;
 use anyhow::{Context, Result};
+use clap::Args;
 use flyrig_fusion::{BudgetSettings, Effort, Origin, Outcome, PersonId, Solver};
 use flyrig_gpu::GpuContext;
 use flyrig_metrics::{CameraScore, ScoreSheet, score_view};
+use flyrig_report::arguments::{GaussiansArgs, OutputArgs};
 use flyrig_report::{
     Replay, frame_number,
     plot::{Line, Plot, Series},
     progress_bar, stop, write_whole,
 };
 use serde::Serialize;
+use std::path::PathBuf;
 
-use crate::cli::BenchBudgetArgs;
+/// Arguments of the command.
+#[derive(Debug, Args)]
+#[command(mut_arg("out", |arg| arg.default_value("out/bench-budget")))]
+pub struct BenchBudgetArgs {
+    /// Data set in EasyMocap layout, as `flyrig eval` and `flyrig sim export` know it.
+    pub dataset: PathBuf,
+    #[command(flatten)]
+    pub replay: ReplayArgs,
+    /// Where pose and masks come from.
+    #[arg(long, value_enum, default_value = "estimated")]
+    pub pose: Origin,
+    /// Budgets, sets a second, comma separated.
+    #[arg(long, value_delimiter = ',', default_value = "1,2,3,4,5,6,8,10,15,30")]
+    pub budgets: Vec<f64>,
+    #[command(flatten)]
+    pub output: OutputArgs,
+    #[command(flatten)]
+    pub surface: GaussiansArgs,
+}
 
 /// Sets that are neither timed nor scored: the first ones always get all the work.
 const WARM_UP: u64 = 12;
@@ -71,7 +93,7 @@ fn ways(pose: Origin, budgets: &[f64]) -> Vec<Way> {
 
 /// Runs the command.
 pub fn budget(args: &BenchBudgetArgs, gpu: &GpuContext) -> Result<()> {
-    std::fs::create_dir_all(&args.out).with_context(|| format!("cannot create {}", args.out.display()))?;
+    args.output.create()?;
     let ways = ways(args.pose, &args.budgets);
     let bar = progress_bar(ways.len() as u64, "bench budget");
     let mut rows = Vec::new();
@@ -85,18 +107,22 @@ pub fn budget(args: &BenchBudgetArgs, gpu: &GpuContext) -> Result<()> {
     }
     bar.finish_and_clear();
     let table = table(&rows);
-    write_whole(&args.out.join("budget.md"), table.as_bytes())?;
-    write_whole(&args.out.join("budget.json"), &serde_json::to_vec_pretty(&rows)?)?;
-    write_whole(&args.out.join("budget.svg"), plot(&rows).svg().as_bytes())?;
-    write_whole(&args.out.join("levels.svg"), plot_levels(&rows).svg().as_bytes())?;
+    write_whole(&args.output.out.join("budget.md"), table.as_bytes())?;
+    write_whole(&args.output.out.join("budget.json"), &serde_json::to_vec_pretty(&rows)?)?;
+    write_whole(&args.output.out.join("budget.svg"), plot(&rows).svg().as_bytes())?;
+    write_whole(&args.output.out.join("levels.svg"), plot_levels(&rows).svg().as_bytes())?;
     print!("{table}");
-    println!("{}; budget.md, .json, .svg and levels.svg in {}", gpu.fastest().adapter_name(), args.out.display());
+    println!(
+        "{}; budget.md, .json, .svg and levels.svg in {}",
+        gpu.fastest().adapter_name(),
+        args.output.out.display()
+    );
     Ok(())
 }
 
 fn run(args: &BenchBudgetArgs, gpu: &GpuContext, way: Way) -> Result<Row> {
     let Way { name, budget, solver } = way;
-    let mut settings = args.replay.settings(&args.dataset, args.pose, args.gaussians, budget);
+    let mut settings = args.replay.settings(&args.dataset, args.pose, args.surface.gaussians, budget);
     settings.session.tracking.solver = solver;
     let mut replay = Replay::open(&settings, gpu)?;
     let (mut sheet, mut millis, mut levels) = (ScoreSheet::default(), Vec::new(), Vec::new());

@@ -3,6 +3,10 @@
 //! Plain cameras of this process at a fixed rate go through everything that real ones go through after their driver: camera
 //! threads, decoding, the queue, the synchronizer.
 
+mod processor_time;
+pub mod record;
+mod steady;
+
 use std::{
     collections::BTreeMap,
     fmt::Write as _,
@@ -10,18 +14,27 @@ use std::{
     time::{Duration, Instant},
 };
 
+use crate::harness::arguments::PlainCameras;
 use anyhow::{Result, ensure};
+use clap::Args;
 use flyrig_capture::{CameraSource, FrameStage as _, JpegEncoding, Pacing};
 use flyrig_fusion::{InputFormat, Intake, resident_mib};
+use flyrig_report::arguments::parse_minutes;
 use flyrig_report::stop;
 use flyrig_sync::SyncSettings;
 use flyrig_types::{Frame, Image, PixelFormat};
+use processor_time::{cpu_share, cpu_ticks};
+use steady::{Steady, host_clock};
 
-use crate::{
-    cli::BenchCaptureArgs,
-    processor::{cpu_share, cpu_ticks},
-    steady::{Steady, host_clock},
-};
+/// Arguments of the command.
+#[derive(Debug, Args)]
+pub struct BenchCaptureArgs {
+    /// How long.
+    #[arg(long, default_value_t = 30.0, value_parser = parse_minutes)]
+    pub minutes: f64,
+    #[command(flatten)]
+    pub rig: PlainCameras,
+}
 
 /// Share of the run after which memory counts: buffers and pools have grown by then.
 const WARM_UP: f64 = 0.1;
@@ -32,7 +45,7 @@ const CELLS: u32 = 40;
 /// Every second camera sends JPEG.
 fn cameras(args: &BenchCaptureArgs) -> Result<Vec<Box<dyn CameraSource>>> {
     let clock = host_clock();
-    let [width, height] = args.size;
+    let [width, height] = args.rig.size;
     let yuyv: Vec<u8> =
         (0..height).flat_map(|y| (0..width).flat_map(move |x| [((x / 8 + y / 8) * 5 % 220 + 16) as u8, 128])).collect();
     let raw = || Image::new(width, height, PixelFormat::Yuyv, yuyv.clone());
@@ -50,9 +63,9 @@ fn cameras(args: &BenchCaptureArgs) -> Result<Vec<Box<dyn CameraSource>>> {
         let is_jpeg = slot % 2 == 1;
         let (format, pictures) = if is_jpeg { (PixelFormat::Mjpeg, &jpeg) } else { (PixelFormat::Yuyv, &yuyv) };
         let (id, pictures) = (format!("{slot:02}").into(), Arc::clone(pictures));
-        Box::new(Steady::new(id, &clock, format, args.size, pictures, args.fps)) as Box<dyn CameraSource>
+        Box::new(Steady::new(id, &clock, format, args.rig.size, pictures, args.rig.fps)) as Box<dyn CameraSource>
     };
-    Ok((0..args.cameras).map(camera).collect())
+    Ok((0..args.rig.cameras).map(camera).collect())
 }
 
 /// Runs the command.
@@ -62,7 +75,7 @@ pub fn capture(args: &BenchCaptureArgs) -> Result<()> {
     let mut intake =
         Intake::start(cameras(args)?, InputFormat::AnySize, &SyncSettings::default(), Pacing::AsDelivered)?.live();
     let run = Duration::from_secs_f64(args.minutes * 60.0);
-    let sets = (run.as_secs_f64() * args.fps * 1.1) as usize;
+    let sets = (run.as_secs_f64() * args.rig.fps * 1.1) as usize;
     // All of its memory is taken before the measurement.
     let mut latencies_us: Vec<u32> = vec![0; sets.max(16)];
     let (mut count, mut memory) = (0, Vec::with_capacity(2 * LOOKS as usize));
@@ -105,11 +118,11 @@ fn report(
         let index = (latencies_us.len().saturating_sub(1) as f64 * share).round() as usize;
         latencies_us.get(index).map_or(0.0, |us| f64::from(*us) / 1e3)
     };
-    let [width, height] = args.size;
+    let [width, height] = args.rig.size;
     let health = intake.health();
     let mut text = format!(
         "{} cameras of {width}x{height} at {} a second (YUYV and MJPEG in turn) for {seconds:.1} s\n",
-        args.cameras, args.fps
+        args.rig.cameras, args.rig.fps
     );
     let _ = writeln!(
         text,
@@ -176,7 +189,7 @@ mod tests {
 
     #[test]
     fn a_short_run_makes_whole_sets() {
-        let args = BenchCaptureArgs { minutes: 0.05, cameras: 2, fps: 30.0, size: [64, 48] };
+        let args = BenchCaptureArgs { minutes: 0.05, rig: PlainCameras { cameras: 2, fps: 30.0, size: [64, 48] } };
         let mut intake =
             Intake::start(cameras(&args).unwrap(), InputFormat::AnySize, &SyncSettings::default(), Pacing::AsDelivered)
                 .unwrap();

@@ -8,20 +8,36 @@ use std::{
     time::{Duration, Instant},
 };
 
+use super::processor_time::{cpu_share, cpu_ticks};
+use super::steady::{Steady, host_clock};
+use crate::harness::arguments::PlainCameras;
 use anyhow::{Context as _, Result, ensure};
+use clap::Args;
 use flyrig_capture::{
     CameraSource, CaptureThreads, Compression, McapReplay, Recorded, Recorder, ThreadsConfig, to_rgb8,
 };
 use flyrig_gpu::GpuContext;
+use flyrig_report::arguments::parse_seconds;
 use flyrig_report::stop;
 use flyrig_sim::{SensorConfig, SimConfig, SimTime, Simulator};
 use flyrig_types::{CameraId, Image, PixelFormat};
+use std::path::PathBuf;
 
-use crate::{
-    cli::BenchRecordArgs,
-    processor::{cpu_share, cpu_ticks},
-    steady::{Steady, host_clock},
-};
+/// Arguments of the command.
+#[derive(Debug, Args)]
+pub struct BenchRecordArgs {
+    /// Seconds for each quality.
+    #[arg(long, default_value_t = 5.0, value_parser = parse_seconds)]
+    pub seconds: f64,
+    /// JPEG qualities, comma separated; 0 records images as they come.
+    #[arg(long, value_delimiter = ',', default_values_t = [0, 80, 90, 95, 98], value_parser = clap::value_parser!(u8).range(0..=100))]
+    pub qualities: Vec<u8>,
+    /// Folder for the recordings, which are removed again; the system's for temporary files otherwise.
+    #[arg(long)]
+    pub folder: Option<PathBuf>,
+    #[command(flatten)]
+    pub rig: PlainCameras,
+}
 
 /// Images that a camera gives in turn.
 const PICTURES: usize = 4;
@@ -44,21 +60,21 @@ struct Row {
 
 /// Runs the command.
 pub fn record(args: &BenchRecordArgs, gpu: &GpuContext) -> Result<()> {
-    let pictures = pictures(args.size, gpu)?;
+    let pictures = pictures(args.rig.size, gpu)?;
     let folder = args.folder.clone().unwrap_or_else(std::env::temp_dir);
-    let [width, height] = args.size;
+    let [width, height] = args.rig.size;
     println!(
         "{} cameras of {width}x{height} YUYV at {} a second, {} s each\n\n\
          | JPEG quality | MB/s a camera | of the raw | PSNR, dB | compressing, cores a camera | writing, cores | frames | dropped |\n\
          |---|---|---|---|---|---|---|---|",
-        args.cameras, args.fps, args.seconds
+        args.rig.cameras, args.rig.fps, args.seconds
     );
     for &quality in &args.qualities {
         ensure!(!stop::requested(), "stopped");
         let path = folder.join(format!("flyrig-bench-{}-{quality}.mcap", std::process::id()));
         let row = run(args, quality, &path, &pictures);
         let removed = std::fs::remove_file(&path);
-        println!("{}", row?.line(args.cameras));
+        println!("{}", row?.line(args.rig.cameras));
         removed.with_context(|| format!("cannot remove {}", path.display()))?;
     }
     Ok(())
@@ -87,9 +103,9 @@ fn run(args: &BenchRecordArgs, quality: u8, path: &Path, pictures: &Arc<Vec<Vec<
     let recorder = Recorder::create(path, &[], compression)?;
     let clock = host_clock();
     let mut sources: Vec<Box<dyn CameraSource>> = Vec::new();
-    for slot in 0..args.cameras {
+    for slot in 0..args.rig.cameras {
         let id = CameraId::from(format!("{slot:02}"));
-        let camera = Steady::new(id, &clock, PixelFormat::Yuyv, args.size, Arc::clone(pictures), args.fps);
+        let camera = Steady::new(id, &clock, PixelFormat::Yuyv, args.rig.size, Arc::clone(pictures), args.rig.fps);
         sources.push(Box::new(recorder.tap(camera)?));
     }
     let threads = CaptureThreads::start(sources, ThreadsConfig::default())?;
@@ -111,8 +127,8 @@ fn run(args: &BenchRecordArgs, quality: u8, path: &Path, pictures: &Arc<Vec<Vec<
         // The sum of none is minus zero.
         threads.fold(0.0, |sum, (_, share)| sum + share)
     };
-    let compressing = of("jpeg ") / f64::from(args.cameras);
-    let psnr_db = psnr_db(path, args.size, pictures)?;
+    let compressing = of("jpeg ") / f64::from(args.rig.cameras);
+    let psnr_db = psnr_db(path, args.rig.size, pictures)?;
     Ok(Row { quality, recorded, seconds, compressing, writing: of("recorder"), psnr_db })
 }
 

@@ -1,12 +1,9 @@
 //! Cameras that do not expose together.
 
+use super::case::{Case, Row, run_session, session};
+use crate::harness::sequence::{Motion, Sequence, SequenceConfig};
 use flyrig_fusion::Solver;
 use flyrig_gpu::{AdapterChoice, GpuContext};
-
-use crate::{
-    case::{Case, Row, run_session, session},
-    sequence::{Motion, Sequence, SequenceConfig},
-};
 
 const SIDE: u32 = 160;
 

@@ -2,10 +2,18 @@
 
 use std::{fmt::Write as _, ops::Range};
 
+use super::case::{Case, chamfer_mm, session};
+use super::cases::VIEWS;
+use crate::harness::{
+    arguments::SimulationArgs,
+    sequence::{Motion, Sequence, SequenceConfig},
+};
 use anyhow::{Context, Result};
+use clap::Args;
 use flyrig_fusion::{GivenPerception, Solver, resident_mib};
 use flyrig_gpu::GpuContext;
 use flyrig_metrics::{ScoreSheet, score_view};
+use flyrig_report::arguments::{GaussiansArgs, OutputArgs};
 use flyrig_report::{
     plot::{Line, Plot, Series},
     progress_bar, stop, write_whole,
@@ -13,12 +21,20 @@ use flyrig_report::{
 use flyrig_types::PoseTrack;
 use serde::Serialize;
 
-use crate::{
-    case::{Case, chamfer_mm, session},
-    cli::BenchEndureArgs,
-    sequence::{Motion, Sequence, SequenceConfig},
-    track::VIEWS,
-};
+/// Arguments of the command.
+#[derive(Debug, Args)]
+#[command(mut_arg("out", |arg| arg.default_value("out/bench-endure")), mut_arg("side", |arg| arg.default_value("160")), mut_arg("gaussians", |arg| arg.default_value("12000")))]
+pub struct BenchEndureArgs {
+    /// Frames in all.
+    #[arg(long, default_value_t = 10_000, value_parser = clap::value_parser!(u64).range(300..=10_000_000))]
+    pub frames: u64,
+    #[command(flatten)]
+    pub output: OutputArgs,
+    #[command(flatten)]
+    pub simulation: SimulationArgs,
+    #[command(flatten)]
+    pub surface: GaussiansArgs,
+}
 
 /// Instants from one end of the movement to the other.
 const INSTANTS: usize = 26;
@@ -38,8 +54,14 @@ struct Point {
 
 /// Runs the command.
 pub fn endure(args: &BenchEndureArgs, gpu: &GpuContext) -> Result<()> {
-    std::fs::create_dir_all(&args.out).with_context(|| format!("cannot create {}", args.out.display()))?;
-    let config = SequenceConfig { motion: Motion::Turn, seed: args.seed, side: args.side, frames: INSTANTS, fps: 30.0 };
+    args.output.create()?;
+    let config = SequenceConfig {
+        motion: Motion::Turn,
+        seed: args.simulation.seed,
+        side: args.simulation.side,
+        frames: INSTANTS,
+        fps: 30.0,
+    };
     let sequence = Sequence::simulate(gpu, config)?;
     let bar = progress_bar(args.frames, "bench endure");
     let points = run(args, gpu, &sequence, |frame, points| {
@@ -56,15 +78,15 @@ pub fn endure(args: &BenchEndureArgs, gpu: &GpuContext) -> Result<()> {
         })
         .collect();
     let csv = format!("frame,psnr_db,ssim,iou,chamfer_mm,memory_mib\n{}", rows.concat());
-    write_whole(&args.out.join("endure.csv"), csv.as_bytes())?;
+    write_whole(&args.output.out.join("endure.csv"), csv.as_bytes())?;
     for (name, title, of) in [
         ("endure.svg", "Chamfer distance, mm", (|p| p.chamfer_mm) as fn(&Point) -> f64),
         ("memory.svg", "Resident memory, MiB", |p| p.memory_mib),
     ] {
-        write_whole(&args.out.join(name), plot(&points, title, of).svg().as_bytes())?;
+        write_whole(&args.output.out.join(name), plot(&points, title, of).svg().as_bytes())?;
     }
     print!("{}", summary(&points));
-    println!("written to {}: endure.csv, endure.svg, memory.svg", args.out.display());
+    println!("written to {}: endure.csv, endure.svg, memory.svg", args.output.out.display());
     Ok(())
 }
 
@@ -75,7 +97,7 @@ fn run(
     sequence: &Sequence,
     mut progress: impl FnMut(u64, &[Point]),
 ) -> Result<Vec<Point>> {
-    let case = Case::new(Solver::GaussNewton, args.gaussians, VIEWS, sequence.config());
+    let case = Case::new(Solver::GaussNewton, args.surface.gaussians, VIEWS, sequence.config());
     let mut session = session(gpu, sequence, &case)?;
     let sets: Vec<_> = sequence.sets(VIEWS).collect();
     let last = sets.len().saturating_sub(1).max(1);
@@ -177,7 +199,12 @@ mod tests {
         let gpu = GpuContext::new(&AdapterChoice::default()).unwrap();
         let config = SequenceConfig { motion: Motion::Turn, seed: 1, side: 64, frames: 3, fps: 30.0 };
         let sequence = Sequence::simulate(&gpu, config).unwrap();
-        let args = BenchEndureArgs { out: "out".into(), seed: 1, frames: 15, side: 64, gaussians: 2000 };
+        let args = BenchEndureArgs {
+            frames: 15,
+            output: OutputArgs { out: "out".into() },
+            simulation: SimulationArgs { seed: 1, side: 64 },
+            surface: GaussiansArgs { gaussians: 2000 },
+        };
         let mut told = 0;
         let points = run(&args, &gpu, &sequence, |frame, _| told = frame).unwrap();
         assert_eq!(told, 15);

@@ -1,12 +1,9 @@
 //! What a benchmark's rows say together: tables, growth, what skipping saves and costs.
 
+use super::case::Row;
+use super::cases::{ALL_DETAIL, ALL_GAUSSIANS, ALL_VIEWS, FULL_SIZE, NO_REST, VIEWS, small};
+use crate::harness::{sequence::Motion, statistics::exponent};
 use std::fmt::Write as _;
-
-use crate::{
-    case::Row,
-    sequence::Motion,
-    track::{ALL_DETAIL, ALL_GAUSSIANS, ALL_VIEWS, FULL_SIZE, NO_REST, VIEWS, small},
-};
 
 /// Everything, for the terminal.
 pub fn summary(rows: &[Row]) -> String {
@@ -104,22 +101,12 @@ fn growth(rows: &[Row]) -> String {
         .collect();
     let mut text = String::new();
     for (name, points) in [("Gaussians", gaussians), ("pixels", pixels), ("views", views)] {
-        if let Some(exponent) = exponent(&points) {
-            let _ = writeln!(text, "time of the deformation grows with the {exponent:.2}th power of the {name}");
+        let power = exponent(&points);
+        if power.is_finite() {
+            let _ = writeln!(text, "time of the deformation grows with the {power:.2}th power of the {name}");
         }
     }
     text
-}
-
-/// Slope of the line through the logarithms, by least squares; none of fewer than two places.
-fn exponent(points: &[(f64, f64)]) -> Option<f64> {
-    let logs: Vec<(f64, f64)> =
-        points.iter().filter(|p| p.0 > 0.0 && p.1 > 0.0).map(|p| (p.0.ln(), p.1.ln())).collect();
-    let n = logs.len() as f64;
-    let (mx, my) = (logs.iter().map(|p| p.0).sum::<f64>() / n, logs.iter().map(|p| p.1).sum::<f64>() / n);
-    let spread: f64 = logs.iter().map(|p| (p.0 - mx).powi(2)).sum();
-    let along: f64 = logs.iter().map(|p| (p.0 - mx) * (p.1 - my)).sum();
-    (spread > 1e-9).then(|| along / spread)
 }
 
 /// Means over the people, skinned only and tracked.
@@ -148,18 +135,4 @@ fn people(rows: &[Row]) -> String {
         );
     }
     text
-}
-
-#[cfg(test)]
-mod tests {
-    use super::*;
-
-    #[test]
-    fn exponents_are_those_of_powers() {
-        let cubes: Vec<(f64, f64)> = [1.0, 2.0, 5.0].map(|x: f64| (x, 7.0 * x.powi(3))).to_vec();
-        assert!(exponent(&cubes).is_some_and(|e| (e - 3.0).abs() < 1e-9));
-        for few in [vec![], vec![(1.0, 2.0)], vec![(2.0, 2.0), (2.0, 3.0)], vec![(0.0, 1.0), (1.0, f64::NAN)]] {
-            assert_eq!(exponent(&few), None);
-        }
-    }
 }

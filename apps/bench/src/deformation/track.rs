@@ -1,21 +1,45 @@
 //! `flyrig-bench track`: error against run time of the deformation, on simulated people whose surface is known.
 
-use anyhow::{Context, Result, ensure};
+use super::case::{Case, run_case};
+use super::cases::{ALL_DETAIL, ALL_GAUSSIANS, ALL_VIEWS, FULL_SIZE, NO_REST, VIEWS, small};
+use super::summary;
+use super::write;
+use crate::harness::{
+    arguments::SimulationArgs,
+    sequence::{Motion, Sequence, SequenceConfig},
+};
+use anyhow::{Result, ensure};
+use clap::{Args, builder::TypedValueParser as _};
 use flyrig_fusion::{PAPER_COLOR_WEIGHT, Solver};
 use flyrig_gpu::GpuContext;
+use flyrig_report::arguments::{GaussiansArgs, OutputArgs};
 use flyrig_report::progress_bar;
 use flyrig_tracker::DeformSolver;
 
-use crate::{
-    case::{Case, run_case},
-    cli::BenchTrackArgs,
-    sequence::{Motion, Sequence, SequenceConfig},
-    summary, write,
-};
+/// Arguments of the command.
+#[derive(Debug, Args)]
+#[command(mut_arg("out", |arg| arg.default_value("out/bench-track")))]
+pub struct BenchTrackArgs {
+    /// Frames of the sequence.
+    #[arg(long, default_value_t = 14, value_parser = clap::value_parser!(u16).range(2..=1000).map(usize::from))]
+    pub frames: usize,
+    /// Only the three solvers.
+    #[arg(long)]
+    pub quick: bool,
+    /// Only the cases whose name has this text in it, "2 views" for example.
+    #[arg(long)]
+    pub only: Option<String>,
+    #[command(flatten)]
+    pub output: OutputArgs,
+    #[command(flatten)]
+    pub simulation: SimulationArgs,
+    #[command(flatten)]
+    pub surface: GaussiansArgs,
+}
 
 /// Runs the command.
 pub fn track(args: &BenchTrackArgs, gpu: &GpuContext) -> Result<()> {
-    std::fs::create_dir_all(&args.out).with_context(|| format!("cannot create {}", args.out.display()))?;
+    args.output.create()?;
     let mut cases = grid(args);
     if let Some(only) = &args.only {
         let names: Vec<String> = cases.iter().map(Case::name).collect();
@@ -33,22 +57,30 @@ pub fn track(args: &BenchTrackArgs, gpu: &GpuContext) -> Result<()> {
         };
         rows.push(run_case(gpu, &scene, &case)?);
         // After every case, so that a run that is stopped leaves what it has.
-        write::all(&args.out, &gpu.fastest().adapter_name(), &rows)?;
+        write::all(&args.output.out, &gpu.fastest().adapter_name(), &rows)?;
         sequence = Some(scene);
         bar.inc(1);
     }
     bar.finish_and_clear();
     print!("{}", summary::summary(&rows));
-    println!("\nwritten to {}: track.csv, track.json, track.txt, track.svg, energy.svg, views.svg", args.out.display());
+    println!(
+        "\nwritten to {}: track.csv, track.json, track.txt, track.svg, energy.svg, views.svg",
+        args.output.out.display()
+    );
     Ok(())
 }
 
 /// What is compared: solvers, iterations, Gaussians, resolution, views, what is skipped, people; ordered so that a sequence
 /// is simulated once.
 fn grid(args: &BenchTrackArgs) -> Vec<Case> {
-    let turn =
-        SequenceConfig { motion: Motion::Turn, seed: args.seed, side: args.side, frames: args.frames, fps: 30.0 };
-    let case = |solver, views, sequence| Case::new(solver, args.gaussians, views, sequence);
+    let turn = SequenceConfig {
+        motion: Motion::Turn,
+        seed: args.simulation.seed,
+        side: args.simulation.side,
+        frames: args.frames,
+        fps: 30.0,
+    };
+    let case = |solver, views, sequence| Case::new(solver, args.surface.gaussians, views, sequence);
     let base = case(Solver::GaussNewton, VIEWS, turn);
     let mut cases = vec![case(Solver::None, VIEWS, turn), case(Solver::Paper, VIEWS, turn), base.clone()];
     if args.quick {
@@ -84,11 +116,11 @@ fn grid(args: &BenchTrackArgs) -> Vec<Case> {
         let name = format!("{most} compared");
         cases.push(case(Solver::GaussNewton, 6, turn).but(&name, |options| options.views = most));
     }
-    for side in [small(args.side), args.side / 2, args.side * 3 / 2] {
+    for side in [small(args.simulation.side), args.simulation.side / 2, args.simulation.side * 3 / 2] {
         let sequence = SequenceConfig { side, ..turn };
         let usual = case(Solver::GaussNewton, VIEWS, sequence);
         cases.push(case(Solver::None, VIEWS, sequence));
-        if side == small(args.side) {
+        if side == small(args.simulation.side) {
             cases.push(usual.but(ALL_DETAIL, |options| *options = options.without_level_of_detail()));
         } else {
             cases.push(usual.but(FULL_SIZE, |options| options.max_level = 0));
@@ -101,22 +133,9 @@ fn grid(args: &BenchTrackArgs) -> Vec<Case> {
         (options.solver.rest, options.color_weight) = (0.0, PAPER_COLOR_WEIGHT);
     }));
     cases.push(still);
-    for seed in (1..=4).filter(|seed| *seed != args.seed) {
+    for seed in (1..=4).filter(|seed| *seed != args.simulation.seed) {
         let sequence = SequenceConfig { seed, ..turn };
         cases.extend([Solver::None, Solver::GaussNewton].map(|solver| case(solver, VIEWS, sequence)));
     }
     cases
 }
-
-/// Images where a pixel covers several of the compared Gaussians.
-pub fn small(side: u32) -> u32 {
-    (side * 5 / 16).max(16)
-}
-
-/// Input cameras, where nothing else is told.
-pub const VIEWS: usize = 3;
-pub const ALL_GAUSSIANS: &str = "all Gaussians";
-pub const FULL_SIZE: &str = "full size";
-pub const ALL_DETAIL: &str = "all detail";
-pub const ALL_VIEWS: &str = "all views";
-pub const NO_REST: &str = "no rest";

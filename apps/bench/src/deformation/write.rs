@@ -2,6 +2,7 @@
 
 use std::{fmt::Write as _, path::Path};
 
+use super::{case::Row, cases::ALL_VIEWS, summary::summary};
 use anyhow::Result;
 use flyrig_fusion::Solver;
 use flyrig_report::{
@@ -9,8 +10,6 @@ use flyrig_report::{
     write_whole,
 };
 use serde::Serialize;
-
-use crate::{case::Row, summary::summary, track::ALL_VIEWS};
 
 #[derive(Serialize)]
 struct Document<'a> {

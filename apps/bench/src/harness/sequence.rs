@@ -2,6 +2,7 @@
 
 use std::sync::Arc;
 
+use super::{images::copy, surface::Points};
 use anyhow::{Context, Result};
 use flyrig_body::Template;
 use flyrig_gpu::GpuContext;
@@ -9,8 +10,6 @@ use flyrig_sim::{MotionConfig, MotionKind, RingConfig, SimConfig, Simulator, Sur
 use flyrig_types::{Camera, Frame, FrameSet, Image, PoseTrack, Rig};
 use glam::DVec3;
 use serde::Serialize;
-
-use super::{stress::copy, surface::Points};
 
 /// Points on the true surface that completeness is measured at.
 const TRUE_POINTS: usize = 20_000;

@@ -2,12 +2,11 @@
 
 use std::sync::Arc;
 
+use crate::harness::images::copy;
 use flyrig_fusion::{EstimatedPerception, Origin, Perception as _, PerceptionSettings, StageTimes};
 use flyrig_gpu::{AdapterChoice, GpuContext};
 use flyrig_sim::{Build, MotionConfig, MotionKind, PersonConfig, RingConfig, SimConfig, Simulator};
 use flyrig_types::{Frame, FrameSet, Image};
-
-use crate::stress::copy;
 
 /// Time from set to set while somebody is seen, and while nobody is.
 const STEP_NANOS: i64 = 200_000_000;

@@ -3,9 +3,17 @@
 //! Simulated people of one rig are composited by depth, so that they hide each other as they would in one room. Each person's
 //! colours are also compared alone and in the scene, on the same pixels: those that show the person in the scene.
 
-use std::{collections::BTreeMap, path::Path, sync::Arc, time::Instant};
+use std::{collections::BTreeMap, path::Path, time::Instant};
 
+use crate::harness::{
+    arguments::SimulationArgs,
+    images::copy,
+    joints::hips,
+    people::{HELD_OUT, INPUTS, capture, frame_set},
+    statistics::mean,
+};
 use anyhow::{Context, Result};
+use clap::{Args, builder::TypedValueParser as _};
 use flyrig_body::{ShapeParams, default_template};
 use flyrig_fusion::{
     BodySettings, EstimatedPerception, GivenPerception, GivenPerson, Origin, PerceptionSettings, PersonId, SHAPE_SECS,
@@ -13,20 +21,38 @@ use flyrig_fusion::{
 };
 use flyrig_gpu::GpuContext;
 use flyrig_metrics::{ScoreSheet, score_view};
+use flyrig_report::arguments::{GaussiansArgs, OutputArgs};
 use flyrig_report::{png, progress_bar, write_whole};
-use flyrig_sim::{MotionConfig, MotionKind, RingConfig, SimConfig, SimFrame, Simulator};
-use flyrig_types::{Frame, FrameSet, Image, Mask, PixelFormat, RenderedView, Rig};
+use flyrig_sim::{MotionConfig, MotionKind, RingConfig, SimConfig, Simulator};
+use flyrig_types::{Image, Mask, RenderedView, Rig};
 
-use crate::{cli::BenchSubjectsArgs, takes::hips};
+/// Arguments of the command.
+#[derive(Debug, Args)]
+#[command(mut_arg("out", |arg| arg.default_value("out/bench-subjects")), mut_arg("seed", |arg| arg.default_value("3")))]
+pub struct BenchSubjectsArgs {
+    /// People in the scene: one waves, the others turn or walk.
+    #[arg(long, default_value_t = 2, value_parser = clap::value_parser!(u8).range(2..=4).map(usize::from))]
+    pub people: usize,
+    /// Poses, shapes and masks from the simulator, or from the images. In the latter case all but the first walk, and it is counted
+    /// how often the tracks change places.
+    #[arg(long, value_enum, default_value = "given")]
+    pub pose: Origin,
+    /// Frames of the sequence; the second half is scored.
+    #[arg(long, default_value_t = 12, value_parser = clap::value_parser!(u16).range(2..=1000).map(usize::from))]
+    pub frames: usize,
+    #[command(flatten)]
+    pub output: OutputArgs,
+    #[command(flatten)]
+    pub simulation: SimulationArgs,
+    #[command(flatten)]
+    pub surface: GaussiansArgs,
+}
 
 /// Half of the distance between two people, metres; of a person from the middle of another one's walk.
 const APART_M: f64 = 0.45;
 const WALK_APART_M: f64 = 0.7;
 /// Coverage from which on a pixel shows somebody.
 const COVERED: u8 = 128;
-/// Input and held-out cameras.
-pub(crate) const INPUTS: [usize; 4] = [0, 2, 4, 6];
-const HELD_OUT: [usize; 3] = [1, 3, 5];
 
 /// One way of tracking.
 struct Row {
@@ -75,7 +101,7 @@ impl Tracks {
 
 /// Runs the command.
 pub fn subjects(args: &BenchSubjectsArgs, gpu: &GpuContext) -> Result<()> {
-    std::fs::create_dir_all(&args.out).with_context(|| format!("cannot create {}", args.out.display()))?;
+    args.output.create()?;
     let mut people = (0..args.people).map(|who| simulator(gpu, args, who)).collect::<Result<Vec<_>>>()?;
     let rig = people[0].rig().clone();
     let bar = progress_bar((args.frames * (args.people + 1)) as u64, "bench subjects");
@@ -98,7 +124,7 @@ pub fn subjects(args: &BenchSubjectsArgs, gpu: &GpuContext) -> Result<()> {
             row.psnr_db,
             own.join(", "),
             row.iou,
-            row.tracks.hips_mm.iter().sum::<f64>() / row.tracks.hips_mm.len() as f64,
+            mean(&row.tracks.hips_mm),
             row.tracks.swaps,
             row.tracks.missed,
             row.set_ms,
@@ -109,9 +135,9 @@ pub fn subjects(args: &BenchSubjectsArgs, gpu: &GpuContext) -> Result<()> {
         let one_ms = alone.iter().map(|row| row.set_ms).sum::<f64>() / alone.len() as f64;
         table += &format!("\nall take {:.2} times as long as one person\n", together.set_ms / one_ms);
     }
-    write_whole(&args.out.join("subjects.md"), table.as_bytes())?;
+    write_whole(&args.output.out.join("subjects.md"), table.as_bytes())?;
     print!("{table}");
-    println!("{}; subjects.md and views in {}", gpu.fastest().adapter_name(), args.out.display());
+    println!("{}; subjects.md and views in {}", gpu.fastest().adapter_name(), args.output.out.display());
     Ok(())
 }
 
@@ -131,50 +157,16 @@ fn simulator(gpu: &GpuContext, args: &BenchSubjectsArgs, who: usize) -> Result<S
         ..MotionConfig::default()
     };
     let mut config = SimConfig {
-        seed: args.seed + who as u64,
+        seed: args.simulation.seed + who as u64,
         motion,
         cameras: RingConfig { count: 7, radius_m: 3.4, ..RingConfig::default() },
-        width: args.side,
-        height: args.side,
+        width: args.simulation.side,
+        height: args.simulation.side,
         ..SimConfig::default()
     };
     // One room for all.
-    config.scene.seed = Some(args.seed);
+    config.scene.seed = Some(args.simulation.seed);
     Ok(Simulator::new(gpu, &config)?)
-}
-
-/// Image and mask of people as one camera sees them, the nearer one in front, and which of them each pixel shows.
-fn composite(frames: &[SimFrame]) -> Result<(Image, Mask, Vec<usize>)> {
-    let first = frames.first().context("nobody was chosen")?;
-    let (width, height) = (first.color.width(), first.color.height());
-    let mut rgb = first.color.bytes().to_vec();
-    let mut coverage = first.mask.coverage().to_vec();
-    let mut depth = first.depth.clone();
-    let mut shown = vec![0; depth.len()];
-    for (who, frame) in frames.iter().enumerate().skip(1) {
-        for i in 0..depth.len() {
-            let (own, cover) = (frame.depth[i], u32::from(frame.mask.coverage()[i]));
-            let in_front = own > 0.0 && (depth[i] <= 0.0 || own < depth[i]);
-            if cover == 0 || !(in_front || depth[i] <= 0.0) {
-                continue;
-            }
-            for c in 0..3 {
-                let (over, under) = (u32::from(frame.color.bytes()[3 * i + c]), u32::from(rgb[3 * i + c]));
-                rgb[3 * i + c] = ((over * cover + under * (255 - cover) + 127) / 255) as u8;
-            }
-            coverage[i] = coverage[i].max(frame.mask.coverage()[i]);
-            if in_front {
-                depth[i] = own;
-                shown[i] = who;
-            }
-        }
-    }
-    Ok((Image::new(width, height, PixelFormat::Rgb8, rgb)?, Mask::new(width, height, coverage)?, shown))
-}
-
-fn capture(people: &mut [Simulator], chosen: &[usize], nanos: i64, slot: usize) -> Result<(Image, Mask, Vec<usize>)> {
-    let frames = chosen.iter().map(|&who| Ok(people[who].render(nanos, slot)?)).collect::<Result<Vec<_>>>()?;
-    composite(&frames)
 }
 
 /// Sum of squared differences of colours, 0 to 1, and their number.
@@ -218,7 +210,8 @@ fn run(
         track: people[who].track().clone(),
         repeat: true,
     };
-    let settings = SessionSettings { body: BodySettings::with_gaussians(args.gaussians), ..SessionSettings::default() };
+    let settings =
+        SessionSettings { body: BodySettings::with_gaussians(args.surface.gaussians), ..SessionSettings::default() };
     let builder = SessionBuilder::new(gpu.clone(), inputs.clone()).settings(settings);
     let mut session = match args.pose {
         Origin::Given => builder.perception(GivenPerception::new(&inputs, chosen.iter().map(given).collect())),
@@ -253,15 +246,15 @@ fn run(
                 }
                 if index as usize + 1 == args.frames {
                     let file = format!("{}-{}", name.replace(' ', "-"), camera.id);
-                    png::write_view(&args.out.join(format!("{file}.png")), &view)?;
+                    png::write_view(&args.output.out.join(format!("{file}.png")), &view)?;
                     let truth = png::encode_rgb(image.bytes(), image.width(), image.height())?;
-                    write_whole(&args.out.join(format!("{file}-truth.png")), &truth)?;
+                    write_whole(&args.output.out.join(format!("{file}-truth.png")), &truth)?;
                 }
             }
         }
         bar.inc(1);
     }
-    write_subjects(&args.out, &name, &session)?;
+    write_subjects(&args.output.out, &name, &session)?;
     let mean = sheet.mean().context("nothing to compare")?;
     Ok(Row {
         name,
@@ -277,10 +270,7 @@ fn run(
 /// Looks for the chosen people with the empty room known, and measures them in the first seconds.
 fn find_people(people: &mut [Simulator], chosen: &[usize], rig: &Rig, inputs: &Rig) -> Result<EstimatedPerception> {
     let settings = PerceptionSettings { people: chosen.len(), ..PerceptionSettings::default() };
-    let plate = |&slot: &usize| -> Result<Option<Image>> {
-        let plate = people[0].plate(slot)?;
-        Ok(Some(Image::new(plate.width(), plate.height(), plate.format(), plate.bytes().to_vec())?))
-    };
+    let plate = |&slot: &usize| -> Result<Option<Image>> { Ok(Some(copy(people[0].plate(slot)?)?)) };
     let plates = INPUTS.iter().map(plate).collect::<Result<Vec<_>>>()?;
     let mut perception =
         EstimatedPerception::new(inputs, &default_template(&ShapeParams::default())?, &settings, &plates)?;
@@ -289,27 +279,6 @@ fn find_people(people: &mut [Simulator], chosen: &[usize], rig: &Rig, inputs: &R
     let fits = perception.learn_shapes(&sets.collect::<Result<Vec<_>>>()?)?;
     fits.iter().for_each(|fit| eprintln!("a person is {fit}"));
     Ok(perception)
-}
-
-pub(crate) fn frame_set(
-    people: &mut [Simulator],
-    chosen: &[usize],
-    rig: &Rig,
-    index: u64,
-    nanos: i64,
-) -> Result<FrameSet> {
-    let frame = |slot: usize| -> Result<Option<Arc<Frame>>> {
-        let (image, mask, _) = capture(people, chosen, nanos, slot)?;
-        Ok(Some(Arc::new(Frame {
-            camera: rig.cameras[slot].id.clone(),
-            sequence: index,
-            capture_nanos: nanos,
-            exposure_nanos: None,
-            image,
-            mask: Some(mask),
-        })))
-    };
-    Ok(FrameSet { index, master_nanos: nanos, frames: INPUTS.into_iter().map(frame).collect::<Result<_>>()? })
 }
 
 /// State and quality of everybody, for the log.

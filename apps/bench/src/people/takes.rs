@@ -2,23 +2,49 @@
 
 use std::{collections::BTreeMap, time::Instant};
 
-use anyhow::{Context, Result};
-use flyrig_body::{ShapeParams, Template, default_template};
+use crate::harness::{
+    arguments::SimulationArgs,
+    images::copy,
+    joints::hips,
+    people::{INPUTS, frame_set},
+    statistics::mean,
+};
+use anyhow::Result;
+use clap::{Args, builder::TypedValueParser as _};
+use flyrig_body::{ShapeParams, default_template};
 use flyrig_fusion::{
     EstimatedPerception, KnownPerson, Observation, Perception as _, PerceptionSettings, PersonId, StageTimes,
 };
 use flyrig_gpu::GpuContext;
+use flyrig_report::arguments::{FpsArgs, OutputArgs, parse_seconds};
 use flyrig_report::{progress_bar, write_whole};
 use flyrig_sim::{MotionConfig, MotionKind, RingConfig, SceneConfig, SimConfig, Simulator};
-use flyrig_types::{Image, Pose, Rig};
+use flyrig_types::{Image, Rig};
 use glam::DVec3;
 
-use crate::{
-    cli::BenchTakesArgs,
-    perception::{mean, places},
-    stress::copy,
-    subjects::{INPUTS, frame_set},
-};
+/// Arguments of the command.
+#[derive(Debug, Args)]
+#[command(mut_arg("out", |arg| arg.default_value("out/bench-takes")), mut_arg("seed", |arg| arg.default_value("601")), mut_arg("side", |arg| arg.default_value("384")), mut_arg("fps", |arg| arg.default_value("10")))]
+pub struct BenchTakesArgs {
+    /// How many takes, each with people and a room of its own.
+    #[arg(long, default_value_t = 20, value_parser = clap::value_parser!(u64).range(1..=1000))]
+    pub takes: u64,
+    /// People in each take: one stays in the middle, the others walk around.
+    #[arg(long, default_value_t = 2, value_parser = clap::value_parser!(u8).range(2..=4).map(usize::from))]
+    pub people: usize,
+    /// Seconds of a take.
+    #[arg(long, default_value_t = 5.0, value_parser = parse_seconds)]
+    pub secs: f64,
+    /// The last person leaves 3 s after the start, for so many seconds; nobody leaves otherwise.
+    #[arg(long, value_parser = parse_seconds)]
+    pub away_secs: Option<f64>,
+    #[command(flatten)]
+    pub output: OutputArgs,
+    #[command(flatten)]
+    pub simulation: SimulationArgs,
+    #[command(flatten)]
+    pub rate: FpsArgs,
+}
 
 /// A track farther than this from everybody follows nobody, metres.
 const ON_SOMEBODY_M: f64 = 0.4;
@@ -50,8 +76,8 @@ struct Take {
 
 /// Runs the command.
 pub fn takes(args: &BenchTakesArgs, gpu: &GpuContext) -> Result<()> {
-    std::fs::create_dir_all(&args.out).with_context(|| format!("cannot create {}", args.out.display()))?;
-    let sets = (args.secs * args.fps).round().max(1.0) as u64;
+    args.output.create()?;
+    let sets = (args.secs * args.rate.fps).round().max(1.0) as u64;
     let bar = progress_bar(args.takes * sets, "bench takes");
     let mut table = String::from(
         "| take | changes of a track | without a track | tracks on nobody | returns to the own track | to another | hips mm | ms a set \
@@ -59,16 +85,16 @@ pub fn takes(args: &BenchTakesArgs, gpu: &GpuContext) -> Result<()> {
     );
     let mut total = Take::default();
     for index in 0..args.takes {
-        let take = run(args, gpu, args.seed + index * args.people as u64, sets, &bar)?;
-        table += &row(&(args.seed + index * args.people as u64).to_string(), &take);
+        let take = run(args, gpu, args.simulation.seed + index * args.people as u64, sets, &bar)?;
+        table += &row(&(args.simulation.seed + index * args.people as u64).to_string(), &take);
         total.add(take);
-        write_whole(&args.out.join("takes.md"), table.as_bytes())?;
+        write_whole(&args.output.out.join("takes.md"), table.as_bytes())?;
     }
     bar.finish_and_clear();
     table += &row("all", &total);
-    write_whole(&args.out.join("takes.md"), table.as_bytes())?;
+    write_whole(&args.output.out.join("takes.md"), table.as_bytes())?;
     print!("{table}");
-    println!("{} people; {}; takes.md in {}", args.people, gpu.fastest().adapter_name(), args.out.display());
+    println!("{} people; {}; takes.md in {}", args.people, gpu.fastest().adapter_name(), args.output.out.display());
     Ok(())
 }
 
@@ -142,7 +168,7 @@ fn run(args: &BenchTakesArgs, gpu: &GpuContext, seed: u64, sets: u64, bar: &indi
     // The last person's track, and whether it left and was not found since.
     let (mut own, mut has_left) = (None, false);
     for index in 0..sets {
-        let secs = index as f64 / args.fps;
+        let secs = index as f64 / args.rate.fps;
         let nanos = (secs * 1e9) as i64;
         let back_secs = LEAVES_SECS + args.away_secs.unwrap_or(0.0);
         let is_away = (LEAVES_SECS..back_secs).contains(&secs);
@@ -178,11 +204,6 @@ fn run(args: &BenchTakesArgs, gpu: &GpuContext, seed: u64, sets: u64, bar: &indi
     Ok(take)
 }
 
-/// World position of the hips in a pose, metres.
-pub(crate) fn hips(template: &Template, pose: &Pose) -> Option<DVec3> {
-    places(&template.skeleton, pose).get("Hips").map(|(place, _)| *place)
-}
-
 /// The first person waves in the middle, the others walk on a circle around at equal distances.
 fn simulator(gpu: &GpuContext, args: &BenchTakesArgs, seed: u64, who: usize) -> Result<Simulator> {
     let motion = MotionConfig {
@@ -194,8 +215,8 @@ fn simulator(gpu: &GpuContext, args: &BenchTakesArgs, seed: u64, who: usize) -> 
         seed: seed + who as u64,
         motion,
         cameras: RingConfig { count: 7, radius_m: 3.4, ..RingConfig::default() },
-        width: args.side,
-        height: args.side,
+        width: args.simulation.side,
+        height: args.simulation.side,
         // One room for all.
         scene: SceneConfig { seed: Some(seed), ..SceneConfig::default() },
         ..SimConfig::default()

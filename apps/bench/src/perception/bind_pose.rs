@@ -2,10 +2,9 @@
 
 use std::collections::BTreeMap;
 
+use crate::harness::{joints::JOINTS, surface::Points};
 use flyrig_body::Template;
 use glam::{DVec3, Vec3};
-
-use crate::{perception::JOINTS, surface::Points};
 
 /// Points on each surface that are measured, and those that they are measured to: 2 mm apart, so that the surface itself counts
 /// as 1 mm away.

@@ -3,7 +3,9 @@
 use std::sync::Arc;
 use std::time::Instant;
 
+use crate::harness::statistics::{mean, percentile};
 use anyhow::{Context, Result};
+use clap::{Args, builder::TypedValueParser as _};
 use flyrig_gpu::GpuContext;
 use flyrig_report::{png, progress_bar, write_whole};
 use flyrig_sim::{MotionConfig, MotionKind, PersonConfig, RingConfig, SimConfig, Simulator};
@@ -13,8 +15,36 @@ use flyrig_tracker::{
 };
 use flyrig_types::{Frame, FrameSet, Image, Mask, Pose};
 use glam::DVec3;
+use std::path::PathBuf;
 
-use crate::cli::BenchHandsArgs;
+/// Arguments of the command.
+#[derive(Debug, Args)]
+pub struct BenchHandsArgs {
+    /// Lengths of the hands in the images, pixels, comma separated.
+    #[arg(long, value_delimiter = ',', default_value = "20,40,80")]
+    pub px: Vec<f64>,
+    /// Seed of the first person; the others follow.
+    #[arg(long, default_value_t = 401)]
+    pub seed: u64,
+    /// How many people.
+    #[arg(long, default_value_t = 4, value_parser = clap::value_parser!(u64).range(1..=1000))]
+    pub people: u64,
+    /// Frame sets of each person, 0.2 seconds apart.
+    #[arg(long, default_value_t = 12, value_parser = clap::value_parser!(u64).range(1..=1000))]
+    pub frames: u64,
+    /// Cameras on a ring of 3 metres.
+    #[arg(long, default_value_t = 4, value_parser = clap::value_parser!(u8).range(1..=32).map(usize::from))]
+    pub cameras: usize,
+    /// ONNX file of another hand network with the same outputs.
+    #[arg(long)]
+    pub hand_net: Option<PathBuf>,
+    /// Folder for the images of each person's first set.
+    #[arg(long)]
+    pub images: Option<PathBuf>,
+    /// Learns the face's points instead and prints their table, at the largest of the lengths.
+    #[arg(long)]
+    pub learn_face: bool,
+}
 
 /// Length of a hand that image sizes are computed from, metres.
 const HAND_M: f64 = 0.18;
@@ -78,7 +108,7 @@ pub fn hands(args: &BenchHandsArgs, gpu: &GpuContext) -> Result<()> {
         for person in 0..args.people {
             measure(args, gpu, px, person, &hand_net, &mut all)?;
         }
-        for (name, errors) in names.iter().zip(&mut all) {
+        for (name, errors) in names.iter().zip(&all) {
             print_row(px, args.cameras, name, errors);
         }
     }
@@ -206,16 +236,7 @@ impl Errors {
     }
 }
 
-fn mean(values: &[f64]) -> f64 {
-    values.iter().sum::<f64>() / values.len() as f64
-}
-
-fn quantile(values: &mut [f64], share: f64) -> f64 {
-    values.sort_by(f64::total_cmp);
-    values.get(((values.len() as f64 - 1.0) * share) as usize).copied().unwrap_or(f64::NAN)
-}
-
-fn print_row(px: f64, cameras: usize, name: &str, errors: &mut Errors) {
+fn print_row(px: f64, cameras: usize, name: &str, errors: &Errors) {
     let number = |value: f64| if value.is_finite() { format!("{value:.1}") } else { "-".to_owned() };
     let sets = errors.sets.max(1) as f64;
     let fitted = format!("{}/{}", errors.fitted, errors.hands);
@@ -223,8 +244,8 @@ fn print_row(px: f64, cameras: usize, name: &str, errors: &mut Errors) {
     println!(
         "{px:>4} {cameras:>7} {name:<26} {:>8} {:>8} {:>8} {fitted:>9} {:>9} {:>9} {:>9} {crops:>8} {:>8.1}",
         number(mean(&errors.tips_mm)),
-        number(quantile(&mut errors.tips_mm, 0.5)),
-        number(quantile(&mut errors.tips_mm, 0.95)),
+        number(percentile(&errors.tips_mm, 0.5)),
+        number(percentile(&errors.tips_mm, 0.95)),
         number(mean(&errors.fitted_mm)),
         number(mean(&errors.head_deg)),
         number(mean(&errors.head_fitted_deg)),

@@ -3,13 +3,27 @@
 //! The result is the table in `tracker/src/habits.rs`.
 
 use anyhow::{Context, Result};
+use clap::Args;
 use flyrig_body::load_gltf;
 use flyrig_capture::{FolderOptions, FolderReplay};
 use flyrig_fusion::next_frame;
+use flyrig_report::arguments::FpsArgs;
 use flyrig_report::{dataset, progress_bar};
 use flyrig_tracker::{Doubt, LANDMARK_NAMES, LandmarkStudy, PoseNet};
+use std::path::PathBuf;
 
-use crate::cli::BenchLandmarksArgs;
+/// Arguments of the command.
+#[derive(Debug, Args)]
+pub struct BenchLandmarksArgs {
+    /// Data sets with an animated glTF body, as `flyrig sim export` writes them; all of their cameras are used.
+    #[arg(required = true)]
+    pub datasets: Vec<PathBuf>,
+    /// Only every so many frames.
+    #[arg(long, default_value_t = 1, value_parser = clap::value_parser!(u64).range(1..))]
+    pub every: u64,
+    #[command(flatten)]
+    pub rate: FpsArgs,
+}
 
 /// Runs the command.
 pub fn landmarks(args: &BenchLandmarksArgs) -> Result<()> {
@@ -19,7 +33,7 @@ pub fn landmarks(args: &BenchLandmarksArgs) -> Result<()> {
         let human = load_gltf(&dataset::gltf_file(folder)?)?;
         let track = human.track.with_context(|| format!("the glTF file of {name} holds no animation"))?;
         let rig = dataset::load_rig(folder, &[])?;
-        let options = FolderOptions { fps: args.fps, frames: None, with_masks: false };
+        let options = FolderOptions { fps: args.rate.fps, frames: None, with_masks: false };
         let bar = progress_bar(rig.cameras.len() as u64, format!("{name} cameras"));
         for camera in &rig.cameras {
             for mut source in FolderReplay::open(folder, Some(std::slice::from_ref(&camera.id)), &options)? {

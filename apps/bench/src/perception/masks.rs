@@ -1,15 +1,28 @@
 //! `flyrig-bench masks`: estimates masks in each camera independently, so that several calibrations are scored against the same masks.
 
 use anyhow::{Context as _, Result};
+use clap::Args;
 use flyrig_body::{ShapeParams, default_template};
 use flyrig_capture::{FolderOptions, FolderReplay};
 use flyrig_fusion::SetReader;
+use flyrig_report::arguments::FpsArgs;
 use flyrig_report::{dataset, frame_number, png, progress_bar, write_whole};
 use flyrig_sync::SyncSettings;
 use flyrig_tracker::{PoseConfig, PoseNet, Viewers};
 use flyrig_types::Rig;
+use std::path::PathBuf;
 
-use crate::cli::BenchMasksArgs;
+/// Arguments of the command.
+#[derive(Debug, Args)]
+pub struct BenchMasksArgs {
+    /// A data set in EasyMocap's layout.
+    pub dataset: PathBuf,
+    /// Folder of the masks, CAM/000000.png.
+    #[arg(long)]
+    pub out: PathBuf,
+    #[command(flatten)]
+    pub rate: FpsArgs,
+}
 
 /// Runs the command.
 pub fn masks(args: &BenchMasksArgs) -> Result<()> {
@@ -19,7 +32,7 @@ pub fn masks(args: &BenchMasksArgs) -> Result<()> {
         let alone = Rig { cameras: vec![camera.clone()], world_up: rig.world_up };
         let plates = dataset::plates(&args.dataset.join("background"), &alone)?;
         let mut viewers = Viewers::new(&PoseNet::embedded()?, &template, &alone, plates, &PoseConfig::default())?;
-        let options = FolderOptions { fps: args.fps, ..FolderOptions::default() };
+        let options = FolderOptions { fps: args.rate.fps, ..FolderOptions::default() };
         let sources = FolderReplay::open(&args.dataset, Some(std::slice::from_ref(&camera.id)), &options)?;
         let count = sources.iter().map(|source| source.remaining() as u64).sum();
         let sources = sources.into_iter().map(|source| Box::new(source) as _).collect();

@@ -3,41 +3,78 @@
 //! Every part of the input (pose, shape, masks) is given or estimated by itself, so that the table shows where the error of
 //! the whole comes from.
 
-use std::{collections::BTreeMap, path::Path, time::Instant};
+mod bind_pose;
+#[cfg(test)]
+mod first_sets_tests;
+pub mod hands;
+#[cfg(test)]
+mod hands_tests;
+pub mod landmarks;
+mod mask_errors;
+pub mod masks;
+pub mod stress;
 
+use std::{
+    collections::BTreeMap,
+    path::{Path, PathBuf},
+    time::Instant,
+};
+
+use crate::harness::{
+    arguments::ReplayArgs,
+    joints::{JOINTS, places},
+    statistics::{mean, percentile},
+};
 use anyhow::{Context, Result, ensure};
-use flyrig_body::{ShapeParams, Skeleton, Template, default_template, load_gltf};
+use clap::Args;
+use flyrig_body::{ShapeParams, Template, default_template, load_gltf};
 use flyrig_fusion::{BodySettings, Origin, Outcome, PerceptionSettings, PersonId, SessionSettings};
 use flyrig_gpu::GpuContext;
 use flyrig_metrics::{CameraScore, ScoreSheet, score_view};
+use flyrig_report::arguments::{GaussiansArgs, OutputArgs};
 use flyrig_report::{Replay, ReplaySettings, dataset, progress_bar, write_whole};
-use flyrig_types::{Frame, FrameSet, Mask, Pose};
-use glam::{DQuat, DVec3};
+use flyrig_types::{Frame, FrameSet, Pose};
+use glam::DVec3;
+use mask_errors::{MaskErrors, write_errors};
 use serde::Serialize;
 
-use crate::{
-    cli::BenchPerceptionArgs,
-    mask_errors::{MaskErrors, write_errors},
-    rest,
-};
-
-/// Joints that are compared, by the names of the CMU skeleton.
-pub(crate) const JOINTS: [&str; 14] = [
-    "Hips",
-    "Head",
-    "LeftArm",
-    "RightArm",
-    "LeftForeArm",
-    "RightForeArm",
-    "LeftHand",
-    "RightHand",
-    "LeftUpLeg",
-    "RightUpLeg",
-    "LeftLeg",
-    "RightLeg",
-    "LeftFoot",
-    "RightFoot",
-];
+/// Arguments of the command.
+#[derive(Debug, Args)]
+#[command(mut_arg("out", |arg| arg.default_value("out/bench-perception")))]
+pub struct BenchPerceptionArgs {
+    /// Data sets with true masks and an animated glTF body, as `flyrig sim export` writes them.
+    #[arg(required = true)]
+    pub datasets: Vec<PathBuf>,
+    /// Only these rows: letters of pose, shape and masks, g for given and e for estimated, comma separated.
+    #[arg(long, value_delimiter = ',')]
+    pub only: Vec<String>,
+    /// Parts of the names of joints whose orientation is the true one, or "place" for the true position, comma separated: what a part
+    /// of the pose costs. For the rows with an estimated pose and the given shape.
+    #[arg(long, value_delimiter = ',')]
+    pub true_joints: Vec<String>,
+    /// Leaves out the deformation and the views: poses, shapes and masks alone, in a fraction of the time.
+    #[arg(long)]
+    pub no_views: bool,
+    /// `perception.look_after_m`: how far the body moves in a view until the network looks at that view again, metres.
+    #[arg(long)]
+    pub look_after_m: Option<f64>,
+    /// Folder of the plates CAM.png; an empty one measures without plates. The data set's own by default.
+    #[arg(long, value_name = "FOLDER")]
+    pub plates: Option<PathBuf>,
+    /// Writes a picture of every so many sets' masks beside the results: red where the person is missing, blue where the mask
+    /// is too large.
+    #[arg(long, value_name = "SETS", value_parser = clap::value_parser!(u64).range(1..))]
+    pub mask_pictures: Option<u64>,
+    /// Description of a landmark network to use in place of the one built in.
+    #[arg(long, value_name = "FILE")]
+    pub network: Option<PathBuf>,
+    #[command(flatten)]
+    pub replay: ReplayArgs,
+    #[command(flatten)]
+    pub output: OutputArgs,
+    #[command(flatten)]
+    pub surface: GaussiansArgs,
+}
 
 /// Sources of the pose, the shape and the masks.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize)]
@@ -85,7 +122,7 @@ struct Row {
 
 /// Runs the command.
 pub fn perception(args: &BenchPerceptionArgs, gpu: &GpuContext) -> Result<()> {
-    std::fs::create_dir_all(&args.out).with_context(|| format!("cannot create {}", args.out.display()))?;
+    args.output.create()?;
     let chosen: Vec<Inputs> =
         ROWS.into_iter().filter(|row| args.only.is_empty() || args.only.contains(&code(*row))).collect();
     ensure!(!chosen.is_empty(), "--only names none of: {}", ROWS.map(code).join(", "));
@@ -94,12 +131,12 @@ pub fn perception(args: &BenchPerceptionArgs, gpu: &GpuContext) -> Result<()> {
         for inputs in &chosen {
             rows.push(run(args, folder, *inputs, gpu)?);
             // After every row, so that a run that is stopped leaves what it has.
-            write_whole(&args.out.join("perception.json"), &serde_json::to_vec_pretty(&rows)?)?;
-            write_whole(&args.out.join("perception.md"), table(&rows).as_bytes())?;
+            write_whole(&args.output.out.join("perception.json"), &serde_json::to_vec_pretty(&rows)?)?;
+            write_whole(&args.output.out.join("perception.md"), table(&rows).as_bytes())?;
         }
     }
     print!("{}", table(&rows));
-    println!("{}; perception.md and perception.json in {}", gpu.fastest().adapter_name(), args.out.display());
+    println!("{}; perception.md and perception.json in {}", gpu.fastest().adapter_name(), args.output.out.display());
     Ok(())
 }
 
@@ -122,15 +159,15 @@ fn run(args: &BenchPerceptionArgs, folder: &Path, inputs: Inputs, gpu: &GpuConte
         network: args.network.clone().unwrap_or_default(),
         ..PerceptionSettings::default()
     };
-    let body = BodySettings::with_gaussians(args.gaussians);
+    let body = BodySettings::with_gaussians(args.surface.gaussians);
     let settings = ReplaySettings {
         dataset: folder.to_owned(),
         recorded: None,
-        inputs: args.inputs.clone(),
-        holdout: if args.no_views { Vec::new() } else { args.holdout.clone() },
+        inputs: args.replay.inputs.clone(),
+        holdout: if args.no_views { Vec::new() } else { args.replay.holdout.clone() },
         session: SessionSettings { perception, body, ..SessionSettings::default() },
-        fps: args.fps,
-        frames: args.frames.clone(),
+        fps: args.replay.rate.fps,
+        frames: args.replay.frames.clone(),
         lags_nanos: BTreeMap::new(),
         true_masks: true,
         true_joints: args.true_joints.clone(),
@@ -159,7 +196,7 @@ fn run(args: &BenchPerceptionArgs, folder: &Path, inputs: Inputs, gpu: &GpuConte
             masks.add(subject.input(view), truth);
             if args.mask_pictures.is_some_and(|every| set.index.is_multiple_of(every)) {
                 let file = format!("{name}-{}-{}-{:06}.png", code(inputs), camera.id, set.index);
-                write_errors(&args.out.join(file), subject.input(view), truth)?;
+                write_errors(&args.output.out.join(file), subject.input(view), truth)?;
             }
         }
         if holdout.is_empty() {
@@ -186,8 +223,8 @@ fn run(args: &BenchPerceptionArgs, folder: &Path, inputs: Inputs, gpu: &GpuConte
         jitter_mm: joints.jitter_mm(),
         joints_mm: joints.by_joint_mm(),
         turns_deg: joints.turns_deg(),
-        shape_mm: subject.and_then(|subject| rest::surface_mm(subject.body(), &truth.template)),
-        average_shape_mm: rest::surface_mm(&average, &truth.template),
+        shape_mm: subject.and_then(|subject| bind_pose::surface_mm(subject.body(), &truth.template)),
+        average_shape_mm: bind_pose::surface_mm(&average, &truth.template),
         masks: masks.mean(),
         view: sheet.mean(),
         set_ms: 1e3 * seconds / f64::from(frames.max(1) as u32),
@@ -198,7 +235,7 @@ fn run(args: &BenchPerceptionArgs, folder: &Path, inputs: Inputs, gpu: &GpuConte
         values.iter().map(|(n, v)| format!("{n} {v:.0}")).collect::<Vec<_>>().join(", ")
     };
     if let (Some(ours), Some(average), Some(subject)) = (row.shape_mm, row.average_shape_mm, subject) {
-        let [height, true_height] = [subject.body(), &truth.template].map(rest::height_m);
+        let [height, true_height] = [subject.body(), &truth.template].map(bind_pose::height_m);
         eprintln!(
             "  body at rest: {ours:.1} mm from the true one, the average body's {average:.1} mm; {height:.3} m tall, \
              truth {true_height:.3} m"
@@ -242,9 +279,7 @@ impl JointErrors {
     }
 
     fn percentile_mm(&self, share: f64) -> f64 {
-        let mut all = self.all();
-        all.sort_by(f64::total_cmp);
-        all.get(((all.len().max(1) - 1) as f64 * share) as usize).copied().unwrap_or(f64::NAN)
+        percentile(&self.all(), share)
     }
 
     fn by_joint_mm(&self) -> BTreeMap<String, f64> {
@@ -264,21 +299,6 @@ impl JointErrors {
 
 fn lengths(vectors: &[DVec3]) -> Vec<f64> {
     vectors.iter().map(|v| v.length()).collect()
-}
-
-pub(crate) fn mean(values: &[f64]) -> f64 {
-    values.iter().sum::<f64>() / values.len() as f64
-}
-
-/// World places of the joints, and the rotations of the parts that they carry from the bind pose, by name.
-pub(crate) fn places(skeleton: &Skeleton, pose: &Pose) -> BTreeMap<String, (DVec3, DQuat)> {
-    let world = skeleton.world_from_canonical(pose);
-    let place = |(joint, world): (&flyrig_body::Joint, &glam::DMat4)| {
-        let origin = joint.joint_from_canonical.inverse().w_axis.truncate();
-        let rotation = world.to_scale_rotation_translation().1.normalize();
-        (joint.name.clone(), (world.transform_point3(origin), rotation))
-    };
-    skeleton.joints().iter().zip(&world).map(place).collect()
 }
 
 fn table(rows: &[Row]) -> String {
@@ -308,9 +328,4 @@ fn table(rows: &[Row]) -> String {
         );
     }
     text
-}
-
-/// Coverage of an input as the session took it in.
-pub(crate) fn coverage(rgba: &[u8], like: &Mask) -> Option<Mask> {
-    Mask::new(like.width(), like.height(), rgba.chunks_exact(4).map(|p| p[3]).collect()).ok()
 }

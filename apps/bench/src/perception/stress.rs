@@ -5,11 +5,19 @@
 
 use std::{collections::BTreeMap, path::Path, sync::Arc};
 
-use anyhow::{Context, Result};
+use crate::harness::{
+    arguments::SimulationArgs,
+    images::copy,
+    joints::{JOINTS, places},
+    statistics::{mean, percentile},
+};
+use anyhow::Result;
+use clap::{Args, builder::TypedValueParser as _};
 use flyrig_body::{ShapeParams, default_template};
 use flyrig_fusion::{EstimatedPerception, Observation, Perception as _, PerceptionSettings, SeenPerson, StageTimes};
 use flyrig_gpu::GpuContext;
 use flyrig_metrics::mask_iou;
+use flyrig_report::arguments::{FpsArgs, OutputArgs};
 use flyrig_report::{paint_outline, png, progress_bar, write_whole};
 use flyrig_sim::{
     Build, LightConfig, LightSwitch, MotionConfig, MotionKind, PersonConfig, RingConfig, SceneConfig, SceneKind,
@@ -18,10 +26,23 @@ use flyrig_sim::{
 use flyrig_types::{Frame, FrameSet, Image, Mask, PixelFormat};
 use glam::{DQuat, DVec3};
 
-use crate::{
-    cli::BenchStressArgs,
-    perception::{mean, places},
-};
+/// Arguments of the command.
+#[derive(Debug, Args)]
+#[command(mut_arg("out", |arg| arg.default_value("out/bench-stress")), mut_arg("seed", |arg| arg.default_value("501")), mut_arg("side", |arg| arg.default_value("384")), mut_arg("fps", |arg| arg.default_value("10")))]
+pub struct BenchStressArgs {
+    /// Only the cases whose names contain one of these texts, comma separated.
+    #[arg(long, value_delimiter = ',')]
+    pub only: Vec<String>,
+    /// Cameras on a ring of 3 metres.
+    #[arg(long, default_value_t = 3, value_parser = clap::value_parser!(u8).range(1..=16).map(usize::from))]
+    pub cameras: usize,
+    #[command(flatten)]
+    pub output: OutputArgs,
+    #[command(flatten)]
+    pub simulation: SimulationArgs,
+    #[command(flatten)]
+    pub rate: FpsArgs,
+}
 
 /// Colour of a mask's outline.
 const OUTLINE: [u8; 3] = [0, 255, 80];
@@ -111,7 +132,7 @@ struct Row {
 
 /// Runs the command.
 pub fn stress(args: &BenchStressArgs, gpu: &GpuContext) -> Result<()> {
-    std::fs::create_dir_all(&args.out).with_context(|| format!("cannot create {}", args.out.display()))?;
+    args.output.create()?;
     let mut table = String::from(
         "| disturbance | joints mm (95 %) before | during | after | mask IoU before | during | after | not found before | during | \
          after | recovery s | ms a set |\n|---|---|---|---|---|---|---|---|---|---|---|---|\n",
@@ -124,10 +145,10 @@ pub fn stress(args: &BenchStressArgs, gpu: &GpuContext) -> Result<()> {
         let line = format_row(&row);
         eprint!("{line}");
         table += &line;
-        write_whole(&args.out.join("stress.md"), table.as_bytes())?;
+        write_whole(&args.output.out.join("stress.md"), table.as_bytes())?;
     }
     print!("{table}");
-    println!("stress.md and images in {}", args.out.display());
+    println!("stress.md and images in {}", args.output.out.display());
     Ok(())
 }
 
@@ -172,21 +193,22 @@ fn simulator(
         _ => Vec::new(),
     };
     let config = SimConfig {
-        seed: args.seed,
+        seed: args.simulation.seed,
         person: PersonConfig { build, ..PersonConfig::default() },
         motion: MotionConfig { kind: case.motion, speed: case.speed, at_m: [at_m, 0.0], ..MotionConfig::default() },
         cameras: RingConfig { count: args.cameras, ..RingConfig::default() },
-        width: args.side,
-        height: args.side,
-        scene: SceneConfig { kind: SceneKind::Office, seed: Some(args.seed), passer_by, ..SceneConfig::default() },
+        width: args.simulation.side,
+        height: args.simulation.side,
+        scene: SceneConfig {
+            kind: SceneKind::Office,
+            seed: Some(args.simulation.seed),
+            passer_by,
+            ..SceneConfig::default()
+        },
         lights,
         ..SimConfig::default()
     };
     Ok(Simulator::new(gpu, &config)?)
-}
-
-pub(crate) fn copy(image: &Image) -> Result<Image> {
-    Ok(Image::new(image.width(), image.height(), image.format(), image.bytes().to_vec())?)
 }
 
 /// The image with every sRGB value multiplied.
@@ -210,68 +232,77 @@ fn camouflaged(image: &Image, plate: &Image, mask: &Mask, top: usize, share: f64
     Ok(Image::new(image.width(), image.height(), image.format(), bytes)?)
 }
 
-fn run(args: &BenchStressArgs, gpu: &GpuContext, case: &Case, index: usize) -> Result<Row> {
-    let at_m = match case.what {
-        Disturbance::OffCentre(metres) => metres,
-        _ => 0.0,
-    };
-    let mut usual = simulator(args, gpu, case, Build::SlimWoman, (0.0, false))?;
-    let mut other = match case.what {
-        Disturbance::OffCentre(_) => Some(simulator(args, gpu, case, Build::SlimWoman, (at_m, false))?),
-        Disturbance::PasserBy => Some(simulator(args, gpu, case, Build::SlimWoman, (0.0, true))?),
-        Disturbance::Replaced => Some(simulator(args, gpu, case, Build::HeavyMan, (0.0, false))?),
-        _ => None,
-    };
-    let rig = usual.rig().clone();
-    let slots: Vec<usize> = (0..rig.cameras.len()).collect();
-    let plates = slots.iter().map(|&slot| Ok(Some(copy(usual.plate(slot)?)?))).collect::<Result<Vec<_>>>()?;
-    let template = default_template(&ShapeParams::default())?;
-    let mut perception = EstimatedPerception::new(&rig, &template, &PerceptionSettings::default(), &plates)?;
+/// The simulated scenes of a case.
+struct Scenes<'a> {
+    case: &'a Case,
+    usual: Simulator,
+    /// Scene during or after the disturbance, where it differs.
+    other: Option<Simulator>,
+    slots: Vec<usize>,
+}
 
-    let total = ((BEFORE_SECS + case.secs + AFTER_SECS) * args.fps) as u64;
-    let bar = progress_bar(total, case.name);
-    let mut row = Row { name: case.name, ..Row::default() };
-    let mut errors: [Vec<f64>; 3] = Default::default();
-    let mut ious: [Vec<f64>; 3] = Default::default();
-    let mut sheet: BTreeMap<usize, Vec<Image>> = BTreeMap::new();
-    let mut seconds = 0.0;
-    for set_index in 0..total {
-        let secs = set_index as f64 / args.fps;
-        let phase = if secs < BEFORE_SECS { 0 } else { 1 + usize::from(secs >= BEFORE_SECS + case.secs) };
-        let (shows_other, is_empty) = match case.what {
+/// A frame set with its true pose and masks.
+struct Shown {
+    set: FrameSet,
+    /// By camera; `None` while the room is empty.
+    truths: Vec<Option<Mask>>,
+    joints: BTreeMap<String, (DVec3, DQuat)>,
+    is_empty: bool,
+}
+
+impl<'a> Scenes<'a> {
+    fn new(args: &BenchStressArgs, gpu: &GpuContext, case: &'a Case) -> Result<Self> {
+        let usual = simulator(args, gpu, case, Build::SlimWoman, (0.0, false))?;
+        let other = match case.what {
+            Disturbance::OffCentre(at_m) => Some(simulator(args, gpu, case, Build::SlimWoman, (at_m, false))?),
+            Disturbance::PasserBy => Some(simulator(args, gpu, case, Build::SlimWoman, (0.0, true))?),
+            Disturbance::Replaced => Some(simulator(args, gpu, case, Build::HeavyMan, (0.0, false))?),
+            _ => None,
+        };
+        let slots = (0..usual.rig().cameras.len()).collect();
+        Ok(Self { case, usual, other, slots })
+    }
+
+    fn plates(&mut self) -> Result<Vec<Option<Image>>> {
+        self.slots.iter().map(|&slot| Ok(Some(copy(self.usual.plate(slot)?)?))).collect()
+    }
+
+    /// Renders the frame set of an instant in a phase: 0 before, 1 during, 2 after the disturbance.
+    fn show(&mut self, index: u64, nanos: i64, phase: usize) -> Result<Shown> {
+        let (shows_other, is_empty) = match self.case.what {
             Disturbance::OffCentre(_) | Disturbance::PasserBy => (phase == 1, false),
             Disturbance::Away => (false, phase == 1),
             Disturbance::Replaced => (phase == 2, phase == 1),
             _ => (false, false),
         };
-        let shown = match &mut other {
+        let shown = match &mut self.other {
             Some(other) if shows_other => other,
-            _ => &mut usual,
+            _ => &mut self.usual,
         };
-        let nanos = (secs * 1e9) as i64;
-        let taken = shown.capture_all(nanos, &slots)?;
+        let taken = shown.capture_all(nanos, &self.slots)?;
+        let joints = places(&shown.template().skeleton, &shown.track().at_repeated(nanos));
         let mut frames = Vec::new();
         let mut truths = Vec::new();
         for (slot, (image, mask)) in taken.into_iter().enumerate() {
             let hit = phase == 1 && slot == 1;
-            let image = match case.what {
+            let camera = shown.rig().cameras[slot].clone();
+            let image = match self.case.what {
                 _ if is_empty => copy(shown.plate(slot)?)?,
                 Disturbance::Covered if hit => scaled(&image, 0.0)?,
                 Disturbance::Dark if phase == 1 => scaled(&image, 0.0)?,
                 Disturbance::Camouflaged(share) if phase == 1 => {
-                    let pose = shown.track().at_repeated(nanos);
-                    let neck = places(&shown.template().skeleton, &pose).get("Neck").map(|(place, _)| *place);
-                    let top = neck.and_then(|neck| rig.cameras[slot].project(neck)).map_or(0.0, |pixel| pixel.y);
+                    let neck = joints.get("Neck").map(|(place, _)| *place);
+                    let top = neck.and_then(|neck| camera.project(neck)).map_or(0.0, |pixel| pixel.y);
                     camouflaged(&image, shown.plate(slot)?, &mask, top.max(0.0) as usize, share)?
                 }
                 Disturbance::Exposure(factor) if hit => scaled(&image, factor)?,
                 _ => image,
             };
             truths.push((!is_empty).then_some(mask));
-            let is_missing = case.what == Disturbance::Missing && hit;
+            let is_missing = self.case.what == Disturbance::Missing && hit;
             let frame = Frame {
-                camera: rig.cameras[slot].id.clone(),
-                sequence: set_index,
+                camera: camera.id,
+                sequence: index,
                 capture_nanos: nanos,
                 exposure_nanos: None,
                 image,
@@ -279,9 +310,72 @@ fn run(args: &BenchStressArgs, gpu: &GpuContext, case: &Case, index: usize) -> R
             };
             frames.push((!is_missing).then(|| Arc::new(frame)));
         }
-        let set = FrameSet { index: set_index, master_nanos: nanos, frames };
+        Ok(Shown { set: FrameSet { index, master_nanos: nanos, frames }, truths, joints, is_empty })
+    }
+}
+
+/// Errors of a case by phase.
+#[derive(Default)]
+struct Tally {
+    row: Row,
+    mm: [Vec<f64>; 3],
+    iou: [Vec<f64>; 3],
+}
+
+impl Tally {
+    /// Adds a frame set. `joints` are the estimated ones, `None` when the person was not found.
+    fn add(
+        &mut self,
+        shown: &Shown,
+        (phase, secs_after): (usize, f64),
+        seen: Option<&SeenPerson>,
+        joints: Option<BTreeMap<String, (DVec3, DQuat)>>,
+    ) -> Result<()> {
+        self.row.sets[phase] += usize::from(!shown.is_empty);
+        let error = joints.map(|joints| joint_error_mm(&joints, &shown.joints));
+        if !shown.is_empty {
+            self.row.lost[phase] += usize::from(error.is_none());
+            self.mm[phase].extend(error.iter().flatten().copied());
+            for (view, truth) in seen.iter().flat_map(|seen| present_masks(seen, &shown.set, &shown.truths)) {
+                self.iou[phase].push(mask_iou(view, truth)?);
+            }
+        }
+        if phase == 2 && self.row.recovery_secs.is_none() {
+            let limit = (RECOVERED.0 * mean(&self.mm[0])).max(RECOVERED.1);
+            if error.is_some_and(|error| mean(&error) < limit) {
+                self.row.recovery_secs = Some(secs_after);
+            }
+        }
+        Ok(())
+    }
+
+    fn into_row(self, name: &'static str, set_ms: f64) -> Row {
+        let Self { mut row, mm, iou } = self;
+        (row.name, row.set_ms) = (name, set_ms);
+        row.mm = [0, 1, 2].map(|k| mean(&mm[k]));
+        row.p95_mm = [0, 1, 2].map(|k| percentile(&mm[k], 0.95));
+        row.iou = [0, 1, 2].map(|k| mean(&iou[k]));
+        row
+    }
+}
+
+fn run(args: &BenchStressArgs, gpu: &GpuContext, case: &Case, index: usize) -> Result<Row> {
+    let mut scenes = Scenes::new(args, gpu, case)?;
+    let rig = scenes.usual.rig().clone();
+    let plates = scenes.plates()?;
+    let template = default_template(&ShapeParams::default())?;
+    let mut perception = EstimatedPerception::new(&rig, &template, &PerceptionSettings::default(), &plates)?;
+    let total = ((BEFORE_SECS + case.secs + AFTER_SECS) * args.rate.fps) as u64;
+    let bar = progress_bar(total, case.name);
+    let mut tally = Tally::default();
+    let mut sheet: BTreeMap<usize, Vec<Image>> = BTreeMap::new();
+    let mut seconds = 0.0;
+    for set_index in 0..total {
+        let secs = set_index as f64 / args.rate.fps;
+        let phase = if secs < BEFORE_SECS { 0 } else { 1 + usize::from(secs >= BEFORE_SECS + case.secs) };
+        let shown = scenes.show(set_index, (secs * 1e9) as i64, phase)?;
         let start = std::time::Instant::now();
-        let observations = perception.observe(&set, &mut StageTimes::default())?;
+        let observations = perception.observe(&shown.set, &mut StageTimes::default())?;
         seconds += start.elapsed().as_secs_f64();
         bar.inc(1);
         let seen = observations.into_iter().find_map(|observation| match observation {
@@ -290,40 +384,20 @@ fn run(args: &BenchStressArgs, gpu: &GpuContext, case: &Case, index: usize) -> R
         });
         let known = perception.people();
         let Some(known) = known.first() else { continue };
-        row.sets[phase] += usize::from(!is_empty);
-        let error = seen.as_ref().map(|seen| {
-            let ours = places(&known.template.skeleton, &seen.pose);
-            joint_error_mm(&ours, &places(&shown.template().skeleton, &shown.track().at_repeated(nanos)))
-        });
-        if !is_empty {
-            row.lost[phase] += usize::from(error.is_none());
-            errors[phase].extend(error.iter().flatten().copied());
-            for (view, truth) in seen.iter().flat_map(|seen| present_masks(seen, &set, &truths)) {
-                ious[phase].push(mask_iou(view, truth)?);
-            }
-        }
-        if phase == 2 && row.recovery_secs.is_none() {
-            let limit = (RECOVERED.0 * mean(&errors[0])).max(RECOVERED.1);
-            if error.is_some_and(|error| mean(&error) < limit) {
-                row.recovery_secs = Some(secs - BEFORE_SECS - case.secs);
-            }
-        }
+        let joints = seen.as_ref().map(|seen| places(&known.template.skeleton, &seen.pose));
+        tally.add(&shown, (phase, secs - BEFORE_SECS - case.secs), seen.as_ref(), joints)?;
         // One image of the middle of each phase, and of the recovery.
         let middles = [0.75 * BEFORE_SECS, BEFORE_SECS + 0.5 * case.secs, BEFORE_SECS + case.secs + 0.5];
         for (place, middle) in middles.into_iter().enumerate() {
-            if (secs - middle).abs() < 0.5 / args.fps {
-                sheet.insert(place, outlined(&set, seen.as_ref())?);
+            if (secs - middle).abs() < 0.5 / args.rate.fps {
+                sheet.insert(place, outlined(&shown.set, seen.as_ref())?);
             }
         }
     }
     bar.finish_and_clear();
-    row.mm = [0, 1, 2].map(|k| mean(&errors[k]));
-    row.p95_mm = [0, 1, 2].map(|k| percentile(&errors[k], 0.95));
-    row.iou = [0, 1, 2].map(|k| mean(&ious[k]));
-    row.set_ms = 1e3 * seconds / total.max(1) as f64;
     let name = format!("{index:02}-{}.png", case.name.replace([' ', '.'], "-"));
-    write_sheet(&args.out.join(name), &sheet.into_values().collect::<Vec<_>>())?;
-    Ok(row)
+    write_sheet(&args.output.out.join(name), &sheet.into_values().collect::<Vec<_>>())?;
+    Ok(tally.into_row(case.name, 1e3 * seconds / total.max(1) as f64))
 }
 
 /// Masks of the views beside the true ones.
@@ -338,10 +412,7 @@ fn present_masks<'a>(
 
 /// Distances of the joints that both have, millimetres.
 fn joint_error_mm(ours: &BTreeMap<String, (DVec3, DQuat)>, truth: &BTreeMap<String, (DVec3, DQuat)>) -> Vec<f64> {
-    crate::perception::JOINTS
-        .iter()
-        .filter_map(|name| Some(1e3 * ours.get(*name)?.0.distance(truth.get(*name)?.0)))
-        .collect()
+    JOINTS.iter().filter_map(|name| Some(1e3 * ours.get(*name)?.0.distance(truth.get(*name)?.0))).collect()
 }
 
 /// RGB images of a set with the masks' outlines.
@@ -375,10 +446,4 @@ fn write_sheet(path: &Path, rows: &[Vec<Image>]) -> Result<()> {
     let png = png::encode_rgb(&rgb, (width * columns) as u32, (height * rows.len()) as u32)?;
     write_whole(path, &png)?;
     Ok(())
-}
-
-fn percentile(values: &[f64], share: f64) -> f64 {
-    let mut sorted = values.to_vec();
-    sorted.sort_by(f64::total_cmp);
-    sorted.get(((sorted.len().max(1) - 1) as f64 * share) as usize).copied().unwrap_or(f64::NAN)
 }

@@ -2,7 +2,12 @@
 
 use std::{fmt::Write as _, time::Instant};
 
+use crate::harness::{
+    sequence::{Motion, Sequence, SequenceConfig},
+    statistics::exponent,
+};
 use anyhow::{Context, Result};
+use clap::{Args, builder::TypedValueParser as _};
 use flyrig_body::{ShapeParams, default_template};
 use flyrig_fusion::{
     BodySettings, EstimatedPerception, GivenPerception, Origin, PerceptionSettings, SHAPE_SETS, Session,
@@ -10,16 +15,38 @@ use flyrig_fusion::{
 };
 use flyrig_gpu::GpuContext;
 use flyrig_metrics::{CameraScore, ScoreSheet, score_view};
+use flyrig_report::arguments::OutputArgs;
 use flyrig_report::{
     plot::{Line, Plot, Series},
     progress_bar, write_whole,
 };
 use serde::Serialize;
 
-use crate::{
-    cli::BenchScaleArgs,
-    sequence::{Motion, Sequence, SequenceConfig},
-};
+/// Arguments of the command.
+#[derive(Debug, Args)]
+#[command(mut_arg("out", |arg| arg.default_value("out/bench-scale")))]
+pub struct BenchScaleArgs {
+    /// Pose and masks from the simulator, or from the images.
+    #[arg(long, value_enum, default_value = "given")]
+    pub pose: Origin,
+    /// Seed of the person.
+    #[arg(long, default_value_t = 1)]
+    pub seed: u64,
+    /// Frames of a sequence; the first twelve are neither timed nor scored.
+    #[arg(long, default_value_t = 24, value_parser = clap::value_parser!(u16).range(13..=1000).map(usize::from))]
+    pub frames: usize,
+    /// Pixels of an image's side, comma separated. The first one is that of the other rows.
+    #[arg(long, value_delimiter = ',', default_value = "512,256,1024,1440", value_parser = clap::value_parser!(u32).range(64..=2048))]
+    pub sides: Vec<u32>,
+    /// Numbers of input cameras, comma separated. The first one is that of the other rows.
+    #[arg(long, value_delimiter = ',', default_value = "3,2,4,6", value_parser = clap::value_parser!(u8).range(1..=6).map(usize::from))]
+    pub views: Vec<usize>,
+    /// Numbers of Gaussians on the person's surface, comma separated. The first one is that of the other rows.
+    #[arg(long, value_delimiter = ',', default_value = "115000,29000,58000,230000", value_parser = clap::value_parser!(u32).range(200..=2_000_000).map(|n| n as usize))]
+    pub gaussians: Vec<usize>,
+    #[command(flatten)]
+    pub output: OutputArgs,
+}
 
 /// Sets that are neither timed nor scored: the first ones get more work.
 const WARM_UP: u64 = 12;
@@ -58,7 +85,7 @@ struct Row {
 
 /// Runs the command.
 pub fn scale(args: &BenchScaleArgs, gpu: &GpuContext) -> Result<()> {
-    std::fs::create_dir_all(&args.out).with_context(|| format!("cannot create {}", args.out.display()))?;
+    args.output.create()?;
     let sizes = sizes(args)?;
     let bar = progress_bar(sizes.len() as u64, "bench scale");
     let mut sequence: Option<Sequence> = None;
@@ -77,11 +104,11 @@ pub fn scale(args: &BenchScaleArgs, gpu: &GpuContext) -> Result<()> {
     }
     bar.finish_and_clear();
     let table = table(&rows);
-    write_whole(&args.out.join("scale.md"), table.as_bytes())?;
-    write_whole(&args.out.join("scale.json"), &serde_json::to_vec_pretty(&rows)?)?;
-    write_whole(&args.out.join("scale.svg"), plot(&rows).svg().as_bytes())?;
+    write_whole(&args.output.out.join("scale.md"), table.as_bytes())?;
+    write_whole(&args.output.out.join("scale.json"), &serde_json::to_vec_pretty(&rows)?)?;
+    write_whole(&args.output.out.join("scale.svg"), plot(&rows).svg().as_bytes())?;
     print!("{table}");
-    println!("{}; scale.md, .json and .svg in {}", gpu.fastest().adapter_name(), args.out.display());
+    println!("{}; scale.md, .json and .svg in {}", gpu.fastest().adapter_name(), args.output.out.display());
     Ok(())
 }
 
@@ -174,16 +201,6 @@ impl Row {
     }
 }
 
-/// Exponent p of `y = c x^p` through points, by least squares of the logarithms; NaN without two places.
-pub(crate) fn exponent(points: &[(f64, f64)]) -> f64 {
-    let logs: Vec<(f64, f64)> = points.iter().map(|(x, y)| (x.ln(), y.ln())).collect();
-    let count = logs.len() as f64;
-    let (mean_x, mean_y) =
-        (logs.iter().map(|(x, _)| x).sum::<f64>() / count, logs.iter().map(|(_, y)| y).sum::<f64>() / count);
-    let covariance: f64 = logs.iter().map(|(x, y)| (x - mean_x) * (y - mean_y)).sum();
-    covariance / logs.iter().map(|(x, _)| (x - mean_x).powi(2)).sum::<f64>()
-}
-
 fn table(rows: &[Row]) -> String {
     let mut text = String::from(
         "| image | cameras | Gaussians | pose ms | rest of the set ms | a view ms | all ms | PSNR dB | SSIM | FLIP | mask IoU |\n\
@@ -241,22 +258,5 @@ fn plot(rows: &[Row]) -> Plot {
         log_x: true,
         log_y: true,
         series: vec![of(Axis::Pixels, "pixels"), of(Axis::Views, "cameras"), of(Axis::Gaussians, "Gaussians")],
-    }
-}
-
-#[cfg(test)]
-mod tests {
-    use super::*;
-
-    #[test]
-    fn exponents_are_those_of_powers() {
-        let of = |power: f64| exponent(&[1.0f64, 2.0, 5.0, 11.0].map(|x| (x, 3.0 * x.powf(power))));
-        for power in [0.0, 0.5, 1.0, 2.0] {
-            assert!((of(power) - power).abs() < 1e-9, "{power}: {}", of(power));
-        }
-        assert!(exponent(&[(3.0, 4.0)]).is_nan());
-        assert!(exponent(&[]).is_nan());
-        // A run time of nothing (a given pose has no perception) is no power.
-        assert!(!exponent(&[(1.0, 0.0), (2.0, 0.0)]).is_finite());
     }
 }

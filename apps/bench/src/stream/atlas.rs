@@ -13,10 +13,8 @@ use anyhow::{Context, Result, ensure};
 use flyrig_fusion::PersonFrame;
 use flyrig_renderer::{linear_from_srgb, srgb_from_linear};
 
-use super::{
-    forms::{Coded, Form, Stream},
-    take::{Kept, Take},
-};
+use super::forms::{Coded, Form, Stream};
+use super::take::{Kept, Take};
 
 /// Of the format IVF, which ffmpeg writes: the file's header, and the header of each frame, which starts with its size.
 const FILE_HEADER: usize = 32;

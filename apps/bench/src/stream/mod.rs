@@ -1,20 +1,21 @@
 //! `flyrig-bench stream`: bytes and run times of the person stream against what it loses, beside other forms of the same Gaussians.
 
+pub mod arguments;
 mod atlas;
 mod forms;
+pub mod receive;
 mod score;
 mod spz;
+mod subject;
 mod table;
 mod take;
 
-pub use take::Subject;
-
-use anyhow::{Context, Result};
+use anyhow::Result;
 use flyrig_gpu::GpuContext;
 use flyrig_report::{progress_bar, stop, write_whole};
 use flyrig_viewer::Scene;
 
-use crate::cli::BenchStreamArgs;
+use arguments::BenchStreamArgs;
 use atlas::Atlas;
 use forms::{AvatarPoses, Form, Packed, Spz, Stream};
 use score::Tally;
@@ -23,7 +24,7 @@ use take::Take;
 
 /// Runs the command.
 pub fn stream(args: &BenchStreamArgs, gpu: &GpuContext) -> Result<()> {
-    std::fs::create_dir_all(&args.out).with_context(|| format!("cannot create {}", args.out.display()))?;
+    args.output.create()?;
     let has_codec = atlas::has_codec();
     if !has_codec {
         eprintln!("the program ffmpeg was not found: no colours are coded as a video");
@@ -42,16 +43,16 @@ pub fn stream(args: &BenchStreamArgs, gpu: &GpuContext) -> Result<()> {
         }
     }
     print!("{}{}", table::table(&rows), table::exponents(&rows));
-    println!("{}; stream.md, .csv, .json and .svg in {}", gpu.fastest().adapter_name(), args.out.display());
+    println!("{}; stream.md, .csv, .json and .svg in {}", gpu.fastest().adapter_name(), args.output.out.display());
     Ok(())
 }
 
 fn write(args: &BenchStreamArgs, rows: &[Row]) -> Result<()> {
     let text = table::table(rows) + &table::exponents(rows);
-    write_whole(&args.out.join("stream.md"), text.as_bytes())?;
-    write_whole(&args.out.join("stream.csv"), table::csv(rows).as_bytes())?;
-    write_whole(&args.out.join("stream.json"), &serde_json::to_vec_pretty(rows)?)?;
-    write_whole(&args.out.join("stream.svg"), table::plot(rows).svg().as_bytes())?;
+    write_whole(&args.output.out.join("stream.md"), text.as_bytes())?;
+    write_whole(&args.output.out.join("stream.csv"), table::csv(rows).as_bytes())?;
+    write_whole(&args.output.out.join("stream.json"), &serde_json::to_vec_pretty(rows)?)?;
+    write_whole(&args.output.out.join("stream.svg"), table::plot(rows).svg().as_bytes())?;
     Ok(())
 }
 

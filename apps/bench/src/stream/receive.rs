@@ -6,26 +6,53 @@ use std::{
     path::Path,
     sync::{
         Arc,
-        mpsc::{Receiver, sync_channel},
+        mpsc::{Receiver, SyncSender, sync_channel},
     },
     thread::Builder,
     time::{Duration, Instant},
 };
 
 use anyhow::{Context as _, Result, ensure};
+use clap::Args;
 use flyrig_access::{KeyFile, Role};
 use flyrig_capture::recorded_messages;
 use flyrig_gpu::GpuContext;
 use flyrig_metrics::{Picture, person_box, psnr};
+use flyrig_report::arguments::parse_seconds;
 use flyrig_report::{progress_bar, stop, write_whole};
 use flyrig_stream::{Posed, StreamTemplate, stamp_of};
-use flyrig_transport::{FetchedTemplate, Interests, Subscriber, TransportConfig};
+use flyrig_transport::{FetchedTemplate, Interests, PersonMessage, Subscriber, TemplateFetcher, TransportConfig};
 use flyrig_types::{Camera, Mask, RenderedView};
 use flyrig_viewer::{Scene, age_secs, clock_secs};
 use flyrig_viewing::{People, Taken};
 use serde::Serialize;
+use std::path::PathBuf;
 
-use crate::cli::BenchReceiveArgs;
+/// Arguments of the command.
+#[derive(Debug, Args)]
+pub struct BenchReceiveArgs {
+    /// The recording that is played (`flyrig watch --record`): views are compared with those of nothing lost. Without one every motion is
+    /// drawn as it comes, and its age then is measured as well.
+    pub take: Option<PathBuf>,
+    /// Key to the rig.
+    #[arg(long, conflicts_with_all = ["rig", "connect"])]
+    pub key: Option<PathBuf>,
+    /// Name of the rig.
+    #[arg(long, default_value = "flyrig")]
+    pub rig: String,
+    /// zenoh endpoint of `flyrig play`.
+    #[arg(long, default_value = "tcp/127.0.0.1:7447")]
+    pub connect: String,
+    /// Seconds from the start to the end.
+    #[arg(long, default_value_t = 30.0, value_parser = parse_seconds)]
+    pub seconds: f64,
+    /// Name of the line in the results.
+    #[arg(long, default_value = "loopback")]
+    pub label: String,
+    /// File of the results (JSON).
+    #[arg(long)]
+    pub out: Option<PathBuf>,
+}
 
 /// Topic of `flyrig watch --record`, and its kinds of messages.
 const TOPIC: &str = "person-stream";
@@ -139,123 +166,194 @@ fn reference(take: &Path) -> Result<BTreeMap<u64, Colors>> {
 }
 
 /// Runs the command.
+///
+/// # Errors
+/// Names what cannot be read, or says why nothing was received.
 pub fn receive(args: &BenchReceiveArgs, gpu: &GpuContext) -> Result<()> {
     let known = args.take.as_deref().map(reference).transpose()?;
     let config = match &args.key {
         Some(path) => TransportConfig::with_key(KeyFile::read(path, &[Role::Viewer, Role::Relay])?),
         None => TransportConfig { connect: vec![args.connect.clone()], ..TransportConfig::subscriber(&args.rig) },
     };
-    // With a take both ends are on one computer: it would bypass the line.
+    // With a take both ends are on one computer: shared memory would bypass the line.
     let config = TransportConfig { shared_memory: known.is_none(), ..config };
     let start = Instant::now();
     let subscriber = Subscriber::open(&config, &Interests { people: true, stats: true, ..Interests::default() })?;
-    let mut templates = subscriber.template_fetcher()?;
-    let mut people = People::default();
-    let mut row = Row { line: args.label.clone(), ..Row::default() };
-    let (mut ages, mut layers, mut bytes, mut motions, mut colors) = (Vec::new(), 0, 0, 0u64, 0u64);
-    let (mut newest, mut last_motion): (Option<i64>, Option<Instant>) = (None, None);
-    let (mut looked, mut compared) = (start, start);
-    let mut offset = None;
-    // Drawing must not keep messages waiting: only the newest of a topic waits.
+    // Rendering must not delay messages: only the newest message of a topic waits.
     let (views, jobs) = sync_channel::<Job>(if known.is_some() { 4 } else { 1 });
     let drawing = Builder::new().name("draw".to_owned()).spawn({
         let gpu = gpu.fastest();
         move || draw(&gpu, jobs)
     })?;
+    let row = Row { line: args.label.clone(), ..Row::default() };
+    let mut reception = Reception::new(&subscriber, known, row, start)?;
     let bar = progress_bar(args.seconds as u64, "bench receive");
     while start.elapsed().as_secs_f64() < args.seconds && !stop::requested() {
         bar.set_position(start.elapsed().as_secs());
-        if let Some(FetchedTemplate { people: of, bytes, .. }) = templates.take().unwrap_or_default() {
-            let template = Arc::new(StreamTemplate::decode(&bytes)?);
-            of.into_iter().for_each(|person| people.meet(person, Arc::clone(&template)));
-        }
-        if let Some(stats) = subscriber.next_stats(Duration::ZERO)? {
-            offset = stats.body.clock_offset_nanos;
-        }
-        let received = subscriber.next_person(Duration::from_millis(5))?;
-        let now = Instant::now();
-        let elapsed = start.elapsed().as_secs_f64();
-        let is_counted = row.motion_after_secs.is_some_and(|after| elapsed >= after + SETTLING.as_secs_f64());
-        let mut is_new = false;
-        if let Some(received) = received {
-            let message = received.body;
-            let is_motion = message.layer.is_none();
-            row.message_after_secs.get_or_insert(elapsed);
-            ensure!(received.latency_is_exact, "both ends must be on one computer, whose clock ages are read from");
-            let taken = people.take(message.person, is_motion, &message.bytes, clock_secs());
-            if let Ok(Taken::Needs(hash)) = taken {
-                templates.ask(message.person, hash);
-            }
-            if is_counted {
-                bytes += message.bytes.len();
-                motions += u64::from(is_motion);
-                colors += u64::from(!is_motion);
-            }
-            if is_motion && matches!(taken, Ok(Taken::Applied)) {
-                row.motion_after_secs.get_or_insert(elapsed);
-                if let Some(last) = last_motion.replace(now).filter(|_| is_counted) {
-                    row.longest_gap_secs = row.longest_gap_secs.max((now - last).as_secs_f64());
-                }
-                newest = newest.max(Some(received.header.capture_nanos));
-                is_new = true;
-            }
-        }
-        let Some((number, person)) = people.iter().next() else { continue };
-        if person.is_complete() {
-            row.complete_after_secs.get_or_insert(elapsed);
-        }
-        if let Some(newest) = newest.filter(|_| is_counted && looked.elapsed() >= LOOK_EVERY) {
-            looked = now;
-            ages.extend(age_secs(newest, offset).map(|secs| 1e3 * secs));
-            layers += subscriber.color_layers();
-        }
-        let is_due = if known.is_some() { compared.elapsed() >= COMPARE_EVERY } else { is_new };
-        if is_counted
-            && is_due
-            && let Some(camera) = subscriber.rig(Duration::ZERO)?.and_then(|rig| rig.cameras.into_iter().next())
-            && let Some(person) = people.get_mut(number)
-            && let Some(motion) = person.motion_at(clock_secs(), false)
-        {
-            let wanted = match &known {
-                None => Some(Wanted::Age(motion.stamp.capture_nanos, offset)),
-                Some(known) => known.get(&motion.stamp.frame).map(|colors| Wanted::Comparison(Arc::clone(colors))),
-            };
-            if let Some(wanted) = wanted {
-                compared = now;
-                let mut posed = Posed::default();
-                let colors = person.pose(&motion, &mut posed);
-                // One that is not drawn in time is left out.
-                drop(views.try_send(Job { posed, colors, camera, wanted }));
-            }
-        }
+        reception.step(&views)?;
     }
     bar.finish_and_clear();
     drop(views);
-    let results = drawing.join().map_err(|_| anyhow::anyhow!("drawing broke off"))??;
-    let counted =
-        row.motion_after_secs.map_or(0.0, |after| start.elapsed().as_secs_f64() - after) - SETTLING.as_secs_f64();
-    if counted > 0.0 {
-        row.motions_per_second = motions as f64 / counted;
-        row.colors_per_second = colors as f64 / counted;
-        row.kilobytes_per_second = bytes as f64 / counted / 1e3;
-        row.color_layers = layers as f64 / ages.len().max(1) as f64;
-    }
-    let [p50, p99] = ranks(ages);
-    (row.age_p50_ms, row.age_p99_ms) = (p50.unwrap_or(0.0), p99.unwrap_or(0.0));
-    [row.drawn_p50_ms, row.drawn_p99_ms] = ranks(results.ages_ms);
-    let scores = results.decibels;
-    row.mean_db = (!scores.is_empty()).then(|| scores.iter().sum::<f64>() / scores.len() as f64);
-    row.worst_db = scores.iter().copied().min_by(f64::total_cmp);
+    let results = drawing.join().map_err(|_| anyhow::anyhow!("the rendering thread failed"))??;
+    let row = reception.into_row(results);
     println!("{}", text(&row));
     if let Some(out) = &args.out {
         write_whole(out, &serde_json::to_vec_pretty(&row)?)?;
     }
     let nothing =
-        || subscriber.trouble().unwrap_or_else(|| "nothing came; is the rig, or `flyrig play`, up?".to_owned());
+        || subscriber.trouble().unwrap_or_else(|| "nothing was received; is the rig, or `flyrig play`, up?".to_owned());
     row.motion_after_secs.map(drop).with_context(nothing)
 }
 
-/// Median and 99th percentile.
+/// People while they are received, and the sums of the measurement.
+struct Reception<'a> {
+    subscriber: &'a Subscriber,
+    templates: TemplateFetcher,
+    people: People,
+    /// Colours of the take by frame, to compare with.
+    known: Option<BTreeMap<u64, Colors>>,
+    row: Row,
+    start: Instant,
+    /// Ages of the newest motion, milliseconds.
+    ages: Vec<f64>,
+    layers: usize,
+    bytes: usize,
+    motions: u64,
+    colors: u64,
+    /// Capture time of the newest motion, nanoseconds.
+    newest: Option<i64>,
+    last_motion: Option<Instant>,
+    looked: Instant,
+    compared: Instant,
+    /// Offset of the rig's clock, nanoseconds.
+    offset: Option<i64>,
+}
+
+impl<'a> Reception<'a> {
+    fn new(subscriber: &'a Subscriber, known: Option<BTreeMap<u64, Colors>>, row: Row, start: Instant) -> Result<Self> {
+        Ok(Self {
+            subscriber,
+            templates: subscriber.template_fetcher()?,
+            people: People::default(),
+            known,
+            row,
+            start,
+            ages: Vec::new(),
+            layers: 0,
+            bytes: 0,
+            motions: 0,
+            colors: 0,
+            newest: None,
+            last_motion: None,
+            looked: start,
+            compared: start,
+            offset: None,
+        })
+    }
+
+    /// Receives at most one message, measures, and passes a due view to the rendering thread.
+    fn step(&mut self, views: &SyncSender<Job>) -> Result<()> {
+        if let Some(FetchedTemplate { people: of, bytes, .. }) = self.templates.take().unwrap_or_default() {
+            let template = Arc::new(StreamTemplate::decode(&bytes)?);
+            of.into_iter().for_each(|person| self.people.meet(person, Arc::clone(&template)));
+        }
+        if let Some(stats) = self.subscriber.next_stats(Duration::ZERO)? {
+            self.offset = stats.body.clock_offset_nanos;
+        }
+        let received = self.subscriber.next_person(Duration::from_millis(5))?;
+        let now = Instant::now();
+        let elapsed = self.start.elapsed().as_secs_f64();
+        let is_counted = self.row.motion_after_secs.is_some_and(|after| elapsed >= after + SETTLING.as_secs_f64());
+        let mut is_new = false;
+        if let Some(received) = received {
+            ensure!(received.latency_is_exact, "both ends must be on one computer, whose clock gives the ages");
+            is_new = self.ingest(&received.body, received.header.capture_nanos, (now, elapsed), is_counted);
+        }
+        let Some((number, person)) = self.people.iter().next() else { return Ok(()) };
+        if person.is_complete() {
+            self.row.complete_after_secs.get_or_insert(elapsed);
+        }
+        if let Some(newest) = self.newest.filter(|_| is_counted && self.looked.elapsed() >= LOOK_EVERY) {
+            self.looked = now;
+            self.ages.extend(age_secs(newest, self.offset).map(|secs| 1e3 * secs));
+            self.layers += self.subscriber.color_layers();
+        }
+        let is_due = if self.known.is_some() { self.compared.elapsed() >= COMPARE_EVERY } else { is_new };
+        if is_counted && is_due { self.send_view(number, now, views) } else { Ok(()) }
+    }
+
+    /// Applies a message. Returns whether it was a new motion.
+    fn ingest(
+        &mut self,
+        message: &PersonMessage,
+        capture_nanos: i64,
+        (now, elapsed): (Instant, f64),
+        is_counted: bool,
+    ) -> bool {
+        let is_motion = message.layer.is_none();
+        self.row.message_after_secs.get_or_insert(elapsed);
+        let taken = self.people.take(message.person, is_motion, &message.bytes, clock_secs());
+        if let Ok(Taken::Needs(hash)) = taken {
+            self.templates.ask(message.person, hash);
+        }
+        if is_counted {
+            self.bytes += message.bytes.len();
+            self.motions += u64::from(is_motion);
+            self.colors += u64::from(!is_motion);
+        }
+        let is_new = is_motion && matches!(taken, Ok(Taken::Applied));
+        if is_new {
+            self.row.motion_after_secs.get_or_insert(elapsed);
+            if let Some(last) = self.last_motion.replace(now).filter(|_| is_counted) {
+                self.row.longest_gap_secs = self.row.longest_gap_secs.max((now - last).as_secs_f64());
+            }
+            self.newest = self.newest.max(Some(capture_nanos));
+        }
+        is_new
+    }
+
+    /// Passes the displayed state of a person to the rendering thread, which skips it while it is busy.
+    fn send_view(&mut self, number: u32, now: Instant, views: &SyncSender<Job>) -> Result<()> {
+        if let Some(camera) = self.subscriber.rig(Duration::ZERO)?.and_then(|rig| rig.cameras.into_iter().next())
+            && let Some(person) = self.people.get_mut(number)
+            && let Some(motion) = person.motion_at(clock_secs(), false)
+        {
+            let wanted = match &self.known {
+                None => Some(Wanted::Age(motion.stamp.capture_nanos, self.offset)),
+                Some(known) => known.get(&motion.stamp.frame).map(|colors| Wanted::Comparison(Arc::clone(colors))),
+            };
+            if let Some(wanted) = wanted {
+                self.compared = now;
+                let mut posed = Posed::default();
+                let colors = person.pose(&motion, &mut posed);
+                drop(views.try_send(Job { posed, colors, camera, wanted }));
+            }
+        }
+        Ok(())
+    }
+
+    /// Returns the row with rates and percentiles.
+    fn into_row(self, results: Results) -> Row {
+        let mut row = self.row;
+        let counted = row.motion_after_secs.map_or(0.0, |after| self.start.elapsed().as_secs_f64() - after)
+            - SETTLING.as_secs_f64();
+        if counted > 0.0 {
+            row.motions_per_second = self.motions as f64 / counted;
+            row.colors_per_second = self.colors as f64 / counted;
+            row.kilobytes_per_second = self.bytes as f64 / counted / 1e3;
+            row.color_layers = self.layers as f64 / self.ages.len().max(1) as f64;
+        }
+        let [p50, p99] = ranks(self.ages);
+        (row.age_p50_ms, row.age_p99_ms) = (p50.unwrap_or(0.0), p99.unwrap_or(0.0));
+        [row.drawn_p50_ms, row.drawn_p99_ms] = ranks(results.ages_ms);
+        let scores = results.decibels;
+        row.mean_db = (!scores.is_empty()).then(|| scores.iter().sum::<f64>() / scores.len() as f64);
+        row.worst_db = scores.iter().copied().min_by(f64::total_cmp);
+        row
+    }
+}
+
+/// Returns the median and the 99th percentile; `None` without values.
 fn ranks(mut values: Vec<f64>) -> [Option<f64>; 2] {
     values.sort_by(f64::total_cmp);
     [0.5, 0.99]

@@ -5,11 +5,9 @@ use flyrig_metrics::{CameraScore, Picture, ScoreSheet, person_box, psnr, score_v
 use flyrig_types::{Mask, RenderedView};
 use flyrig_viewer::{Scene, ShownPerson};
 
-use super::{
-    forms::Coded,
-    table::Row,
-    take::{Kept, Take},
-};
+use super::forms::Coded;
+use super::table::Row;
+use super::take::{Kept, Take};
 
 /// Sums of a form so far.
 #[derive(Default)]

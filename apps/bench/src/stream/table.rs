@@ -2,11 +2,10 @@
 
 use std::fmt::Write as _;
 
+use crate::harness::statistics::exponent;
 use flyrig_fusion::Origin;
 use flyrig_report::plot::{Line, Plot, Series};
 use serde::Serialize;
-
-use crate::scale::exponent;
 
 /// One data set in one form.
 #[derive(Debug, Serialize)]

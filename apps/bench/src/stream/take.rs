@@ -5,6 +5,9 @@ use std::{
     sync::Arc,
 };
 
+use super::arguments::BenchStreamArgs;
+use super::subject::{SIMULATED, Subject};
+use crate::harness::images::copy;
 use anyhow::{Context, Result, ensure};
 use flyrig_fusion::{BudgetSettings, Origin, Outcome, PersonFrame, PersonId, Session};
 use flyrig_gpu::GpuContext;
@@ -14,40 +17,15 @@ use flyrig_sim::{ExportOptions, MotionConfig, MotionKind, SimConfig, Simulator, 
 use flyrig_stream::EncodedTemplate;
 use flyrig_transport::SplatState;
 use flyrig_types::{Camera, Image, Mask, RenderedView};
-use serde::{Deserialize as _, de::IntoDeserializer as _};
-
-use crate::{cli::BenchStreamArgs, stress::copy};
 
 /// Sets that are neither counted nor scored: colours are sent for the first time.
 const WARM_UP: usize = 12;
 /// Frames of a simulated person, where no range is given.
 const SIMULATED_FRAMES: u64 = 40;
-/// Starts the name of a simulated person.
-const SIMULATED: &str = "sim:";
-
-/// A data set to code.
-#[derive(Debug, Clone)]
-pub enum Subject {
-    /// A folder in EasyMocap layout.
-    Folder(PathBuf),
-    /// A simulated person with this motion.
-    Simulated(MotionKind, String),
-}
-
-impl std::str::FromStr for Subject {
-    type Err = String;
-
-    fn from_str(text: &str) -> Result<Self, String> {
-        let Some(name) = text.strip_prefix(SIMULATED) else { return Ok(Self::Folder(text.into())) };
-        let kind: Result<MotionKind, serde::de::value::Error> = MotionKind::deserialize(name.into_deserializer());
-        Ok(Self::Simulated(kind.map_err(|error| error.to_string())?, name.to_owned()))
-    }
-}
-
 /// Returns name and folder of every data set; simulated people are exported to the folder of the results first, unless they are
 /// there already. Each has a seed of its own.
 pub fn folders(args: &BenchStreamArgs, gpu: &GpuContext) -> Result<Vec<(String, PathBuf)>> {
-    let mut seed = args.seed;
+    let mut seed = args.simulation.seed;
     let mut folders = Vec::new();
     for subject in &args.datasets {
         folders.push(match subject {
@@ -57,8 +35,9 @@ pub fn folders(args: &BenchStreamArgs, gpu: &GpuContext) -> Result<Vec<(String, 
             }
             Subject::Simulated(kind, motion) => {
                 let frames = args.replay.frames.as_ref().map_or(SIMULATED_FRAMES, |frames| frames.end);
-                let folder = args.out.join("takes").join(format!("{motion}-{seed}-{}-{frames}", args.side));
-                simulate(gpu, &folder, *kind, seed, args.side, frames)?;
+                let folder =
+                    args.output.out.join("takes").join(format!("{motion}-{seed}-{}-{frames}", args.simulation.side));
+                simulate(gpu, &folder, *kind, seed, args.simulation.side, frames)?;
                 seed += 1;
                 (format!("{SIMULATED}{motion}"), folder)
             }

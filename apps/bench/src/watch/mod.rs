@@ -4,15 +4,43 @@
 use std::time::Instant;
 
 use anyhow::{Context as _, Result};
+use clap::Args;
 use flyrig_calib::{CameraWatch, WatchState, WatchedImage};
 use flyrig_gpu::GpuContext;
+use flyrig_report::arguments::parse_minutes;
 use flyrig_report::progress_bar;
 use flyrig_sim::{LightConfig, LightSwitch, MotionConfig, MotionKind, RingConfig, Shot, SimConfig, Simulator};
 use flyrig_types::{Camera, Image, Isometry};
 use glam::{DQuat, DVec3};
 use rand::{RngExt as _, SeedableRng as _, rngs::SmallRng};
 
-use crate::cli::BenchWatchArgs;
+/// Arguments of the command.
+#[derive(Debug, Args)]
+pub struct BenchWatchArgs {
+    /// Number of bumps.
+    #[arg(long, default_value_t = 12)]
+    pub bumps: u32,
+    /// Rotation of a bump, degrees.
+    #[arg(long, default_value_t = 0.3)]
+    pub deg: f64,
+    /// Translation of a bump, millimetres.
+    #[arg(long, default_value_t = 5.0)]
+    pub mm: f64,
+    /// Simulated minutes without a bump.
+    #[arg(long, default_value_t = 30.0, value_parser = parse_minutes)]
+    pub minutes: f64,
+    /// Number of cameras.
+    #[arg(long, default_value_t = 3, value_parser = clap::value_parser!(u32).range(1..))]
+    pub cameras: u32,
+    /// Width of an image, pixels.
+    #[arg(long, default_value_t = 1280)]
+    pub width: u32,
+    /// Height of an image, pixels.
+    #[arg(long, default_value_t = 720)]
+    pub height: u32,
+    #[arg(long, default_value_t = 1)]
+    pub seed: u64,
+}
 
 /// Time between looks, seconds.
 const EVERY_SECS: f64 = 1.0;
@@ -24,12 +52,45 @@ const SWITCH_SECS: f64 = 20.0;
 const JUMP_SECS: f64 = 15.0;
 
 /// Runs the command.
+///
+/// # Errors
+/// Those of the simulator and of cameras that show too few corners.
 pub fn watch(args: &BenchWatchArgs, gpu: &GpuContext) -> Result<()> {
     let mut look_ms = Vec::new();
-    let (mut found, mut other, mut late_secs, mut shares) = (0u32, 0u32, Vec::new(), Vec::new());
-    let (mut left_shares, mut left_px) = (Vec::new(), Vec::new());
+    let mut found = Found::default();
     let bar = progress_bar(u64::from(args.bumps), "bumps");
     for bump in 0..args.bumps {
+        found.bump(args, gpu, bump, &mut look_ms)?;
+        bar.inc(1);
+    }
+    bar.finish_and_clear();
+    found.print(args);
+    quiet(args, gpu, &mut look_ms)?;
+    let (ms, worst_ms) = median_and_worst(&mut look_ms);
+    println!(
+        "a check takes {ms:.1} ms (at worst {worst_ms:.1}): {:.2} % of a core for each camera",
+        0.1 * ms / EVERY_SECS
+    );
+    Ok(())
+}
+
+/// Reports about bumped cameras.
+#[derive(Default)]
+struct Found {
+    count: u32,
+    /// Checks that reported a camera that was not bumped.
+    other: u32,
+    late_secs: Vec<f64>,
+    /// Error of the rotation as a share of the bump.
+    shares: Vec<f64>,
+    /// Reprojection error after the correction as a share of that before, and in pixels.
+    left_shares: Vec<f64>,
+    left_px: Vec<f64>,
+}
+
+impl Found {
+    /// Simulates a bump until it is reported, or for [`AFTER`] checks.
+    fn bump(&mut self, args: &BenchWatchArgs, gpu: &GpuContext, bump: u32, look_ms: &mut Vec<f64>) -> Result<()> {
         let mut room = Room::new(args, gpu, u64::from(bump), (BEFORE + AFTER) as f64 * EVERY_SECS)?;
         let slot = bump as usize % args.cameras as usize;
         let turn = room.direction() * args.deg.to_radians();
@@ -45,7 +106,7 @@ pub fn watch(args: &BenchWatchArgs, gpu: &GpuContext) -> Result<()> {
                     WatchState::Moved(motion) if of == slot && look >= BEFORE => {
                         reported.get_or_insert((look - BEFORE, motion));
                     }
-                    WatchState::Moved(_) => other += 1,
+                    WatchState::Moved(_) => self.other += 1,
                     _ => {}
                 }
             }
@@ -53,53 +114,58 @@ pub fn watch(args: &BenchWatchArgs, gpu: &GpuContext) -> Result<()> {
                 break;
             }
         }
-        if reported.is_none() {
+        let Some((looks, motion)) = reported else {
             let axis = turn / turn.length();
-            println!("bump {bump}, about {axis:.2}, was not found; the last look: {:.2?}", watches[slot].last_motion());
-        }
-        if let Some((looks, motion)) = reported {
-            found += 1;
-            late_secs.push((looks + 1) as f64 * EVERY_SECS);
-            // `turn` moves points into the axes of the moved camera: the opposite of its own rotation.
-            shares.push((motion.rotation + turn).length() / turn.length());
-            let calibrated = &room.simulator.rig().cameras[slot];
-            let bumped = Camera { camera_from_world: shift * calibrated.camera_from_world, ..calibrated.clone() };
-            let [as_it_was, corrected] =
-                [calibrated, &motion.applied_to(calibrated)].map(|camera| apart_px(camera, &bumped));
-            left_shares.push(corrected / as_it_was);
-            left_px.push(corrected);
-        }
-        bar.inc(1);
+            println!("bump {bump}, about {axis:.2}, was not found; last motion: {:.2?}", watches[slot].last_motion());
+            return Ok(());
+        };
+        self.count += 1;
+        self.late_secs.push((looks + 1) as f64 * EVERY_SECS);
+        // `turn` moves points into the axes of the moved camera: the opposite of its own rotation.
+        self.shares.push((motion.rotation + turn).length() / turn.length());
+        let calibrated = &room.simulator.rig().cameras[slot];
+        let bumped = Camera { camera_from_world: shift * calibrated.camera_from_world, ..calibrated.clone() };
+        let [as_it_was, corrected] =
+            [calibrated, &motion.applied_to(calibrated)].map(|camera| apart_px(camera, &bumped));
+        self.left_shares.push(corrected / as_it_was);
+        self.left_px.push(corrected);
+        Ok(())
     }
-    bar.finish_and_clear();
-    let median = |values: &mut Vec<f64>| {
-        values.sort_by(f64::total_cmp);
-        (values.get(values.len() / 2).copied().unwrap_or(f64::NAN), values.last().copied().unwrap_or(f64::NAN))
-    };
-    let ((late, latest), (share, worst)) = (median(&mut late_secs), median(&mut shares));
-    println!(
-        "bumps of {} degrees and {} mm, {} cameras of {}x{}: {found} of {} found, after {late:.0} s (at worst {latest:.0} s); rotation off by \
-         {:.0} % of the bump (at worst {:.0} %), its translation included; {other} looks at other cameras took them for bumped",
-        args.deg,
-        args.mm,
-        args.cameras,
-        args.width,
-        args.height,
-        args.bumps,
-        100.0 * share,
-        100.0 * worst
-    );
-    let ((share, worst), (px, worst_px)) = (median(&mut left_shares), median(&mut left_px));
-    println!(
-        "where people stand, images of the corrected cameras are {px:.1} px off (at worst {worst_px:.1}): {:.0} % of what they are without \
-         correction (at worst {:.0} %)",
-        100.0 * share,
-        100.0 * worst
-    );
+
+    fn print(&mut self, args: &BenchWatchArgs) {
+        let ((late, latest), (share, worst)) =
+            (median_and_worst(&mut self.late_secs), median_and_worst(&mut self.shares));
+        println!(
+            "bumps of {} degrees and {} mm, {} cameras of {}x{}: {} of {} found, after {late:.0} s (at worst {latest:.0} s); error of the \
+             rotation {:.0} % of the bump (at worst {:.0} %), its translation included; {} checks of other cameras reported a bump",
+            args.deg,
+            args.mm,
+            args.cameras,
+            args.width,
+            args.height,
+            self.count,
+            args.bumps,
+            100.0 * share,
+            100.0 * worst,
+            self.other
+        );
+        let ((share, worst), (px, worst_px)) =
+            (median_and_worst(&mut self.left_shares), median_and_worst(&mut self.left_px));
+        println!(
+            "reprojection error of the corrected cameras in the volume of people: {px:.1} px (at worst {worst_px:.1}), {:.0} % of that \
+             without correction (at worst {:.0} %)",
+            100.0 * share,
+            100.0 * worst
+        );
+    }
+}
+
+/// Watches cameras that are not bumped, and prints the false alarms.
+fn quiet(args: &BenchWatchArgs, gpu: &GpuContext, look_ms: &mut Vec<f64>) -> Result<()> {
     let looks = (args.minutes * 60.0 / EVERY_SECS) as u64;
     let mut room = Room::new(args, gpu, 1000, args.minutes * 60.0)?;
     let mut watches = room.watches()?;
-    let bar = progress_bar(looks, "looks without a bump");
+    let bar = progress_bar(looks, "checks without a bump");
     let (mut alarms, mut steady) = (0u64, 0u64);
     for look in 1..=looks {
         for (slot, watch) in watches.iter_mut().enumerate() {
@@ -114,16 +180,17 @@ pub fn watch(args: &BenchWatchArgs, gpu: &GpuContext) -> Result<()> {
     }
     bar.finish_and_clear();
     println!(
-        "{:.0} minutes of switched lights, somebody walking, and exposure jumps: {alarms} false alarms; {steady} of {} looks steady",
+        "{:.0} minutes of switched lights, a walking person, and exposure jumps: {alarms} false alarms; {steady} of {} checks steady",
         args.minutes,
         looks * u64::from(args.cameras)
     );
-    let (ms, worst_ms) = median(&mut look_ms);
-    println!(
-        "a look takes {ms:.1} ms (at worst {worst_ms:.1}): {:.2} % of a core for each camera",
-        0.1 * ms / EVERY_SECS
-    );
     Ok(())
+}
+
+/// Sorts values, and returns the median and the largest; NaN without values.
+fn median_and_worst(values: &mut [f64]) -> (f64, f64) {
+    values.sort_by(f64::total_cmp);
+    (values.get(values.len() / 2).copied().unwrap_or(f64::NAN), values.last().copied().unwrap_or(f64::NAN))
 }
 
 /// Mean distance between the images of points in the volume that people fill, pixels.

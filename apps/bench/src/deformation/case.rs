@@ -1,5 +1,9 @@
 //! One way of tracking, and what it gave.
 
+use crate::harness::{
+    sequence::{Motion, Sequence, SequenceConfig},
+    surface::Points,
+};
 use anyhow::{Context, Result};
 use flyrig_fusion::{
     BodySettings, DeformOptions, GivenPerception, PROCESSOR_STAGE, PersonId, Session, SessionBuilder, SessionSettings,
@@ -9,11 +13,6 @@ use flyrig_gpu::GpuContext;
 use flyrig_metrics::{ScoreSheet, score_view};
 use flyrig_tracker::FIRST_FRAMES;
 use serde::Serialize;
-
-use crate::{
-    sequence::{Motion, Sequence, SequenceConfig},
-    surface::Points,
-};
 
 /// Points on the tracked surface.
 const OUR_POINTS: usize = 20_000;
