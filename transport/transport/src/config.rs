@@ -33,7 +33,8 @@ pub struct TransportConfig {
     pub shared_memory: bool,
     /// Publisher: how many subscribers may have a viewpoint of their own.
     pub max_viewers: usize,
-    /// Publisher: how long a viewpoint lives without being renewed, milliseconds.
+    /// Publisher: how long a viewpoint lives without being renewed, milliseconds. Not part of a configuration.
+    #[serde(skip)]
     pub viewpoint_lease_millis: u64,
     /// Publisher: pixels a second that all viewpoints may ask for together, width * height * frame rate each; more is
     /// refused. The default is four viewers with 512x512 pixels at 30 a second.

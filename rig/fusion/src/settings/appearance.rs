@@ -17,15 +17,19 @@ pub enum AppearanceMode {
     /// Projection, spatial diffusion and temporal memory.
     #[default]
     Direct,
-    /// Without the temporal memory.
+    /// Ablation without the temporal memory.
+    #[value(hide = true)]
     DirectNoTime,
-    /// Projection only, as the paper's "w/o ST" baseline.
+    /// Ablation with projection only, the paper's "w/o ST" baseline.
+    #[value(hide = true)]
     DirectNoSpaceTime,
     /// `direct`, and the corrections of trained networks.
     Stfa,
-    /// The same without the temporal memory.
+    /// Ablation of `stfa` without the temporal memory.
+    #[value(hide = true)]
     StfaNoTime,
-    /// The same without graph and memory.
+    /// Ablation of `stfa` without graph and memory.
+    #[value(hide = true)]
     StfaNoSpaceTime,
 }
 
@@ -39,6 +43,12 @@ impl AppearanceMode {
             Self::DirectNoSpaceTime | Self::StfaNoSpaceTime => (false, false),
         };
         AppearanceSettings { space, time, ..AppearanceSettings::default() }
+    }
+
+    /// Whether the mode leaves parts of the method out, for measurements only.
+    #[must_use]
+    pub fn is_ablation(self) -> bool {
+        !matches!(self, Self::Direct | Self::Stfa)
     }
 
     /// Whether networks correct direct appearance.
