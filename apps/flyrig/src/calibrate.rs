@@ -14,9 +14,26 @@ mod views;
 use std::path::Path;
 
 use anyhow::{Result, bail};
+use clap::Subcommand;
 use flyrig_gpu::GpuContext;
 
-use crate::cli::CalibrateAction;
+#[derive(Debug, Subcommand)]
+pub enum CalibrateAction {
+    /// Write a board to print (SVG, PDF) and its description, board.toml.
+    Board(board::CalibrateBoardArgs),
+    /// Calibrate the lens of each camera from a take in which it sees the board in many poses.
+    Lens(lens::CalibrateLensArgs),
+    /// Calibrate the poses, and time offsets, of all cameras from a take in which they see the board together.
+    Rig(rig::CalibrateRigArgs),
+    /// Calibrate lenses and poses while the board is shown, with hints what to show next, in the terminal and on a local page.
+    Live(live::CalibrateLiveArgs),
+    /// Refine poses and time offsets of calibrated cameras from one person who moves before them.
+    Person(person::CalibratePersonArgs),
+    /// Match the colours of calibrated cameras: exposure, white balance, response and vignetting, from people before them.
+    Color(color::CalibrateColorArgs),
+    /// Convert a calibration of another program, or to one.
+    Convert(convert::CalibrateConvertArgs),
+}
 
 /// Files of a calibrated rig.
 const FILES: [&str; 2] = ["calibration.toml", "calibration.json"];

@@ -25,7 +25,65 @@ use flyrig_types::{Camera, Frame, FrameSet, Rig};
 use indicatif::ProgressBar;
 use serde::{Deserialize as _, Serialize, de::IntoDeserializer as _};
 
-use crate::{cli::DemoArgs, source::simulated_plates, watch::WatchStats};
+use crate::{source::simulated_plates, watch::WatchStats};
+use clap::Args;
+use flyrig_fusion::BudgetSettings;
+use flyrig_fusion::PerceptionSettings;
+use flyrig_fusion::TrackingSettings;
+use flyrig_report::arguments::{GaussiansArgs, OutputArgs, parse_minutes};
+use std::net::SocketAddr;
+use std::path::PathBuf;
+
+#[derive(Debug, Args)]
+#[command(mut_arg("out", |arg| arg.default_value("out/demo")))]
+pub struct DemoArgs {
+    /// Frames of the simulated rig.
+    #[arg(long, default_value_t = 60, conflicts_with = "minutes")]
+    pub frames: usize,
+    /// Run for so long instead, the motion repeating.
+    #[arg(long, value_parser = parse_minutes)]
+    pub minutes: Option<f64>,
+    /// Seed of the person and the room.
+    #[arg(long, default_value_t = 1)]
+    pub seed: u64,
+    /// "turn", "walk", "wave", "squat", "reach", "sit", "lie", "jump", "cross-arms", "dance", "still", "by-seed", "bvh" (a captured
+    /// walk from Debian's assimp-testmodels), or a *.bvh, *.glb or *.gltf file.
+    #[arg(long, default_value = "turn")]
+    pub motion: String,
+    /// TOML file with faults of cameras and clocks, like sim/assets/faults.toml.
+    #[arg(long)]
+    pub faults: Option<PathBuf>,
+    /// Pose from the images, or from the simulator.
+    #[arg(long, value_enum, default_value = "estimated")]
+    pub pose: Origin,
+    /// Masks from the images and the empty room, or from the simulator.
+    #[arg(long, value_enum, default_value = "estimated")]
+    pub masks: Origin,
+    /// Shape of the body from the images, or from the simulator; by default from where the pose comes.
+    #[arg(long, value_enum)]
+    pub shape: Option<Origin>,
+    #[command(flatten)]
+    pub tracking: TrackingSettings,
+    #[command(flatten)]
+    pub appearance: AppearanceOptions,
+    #[command(flatten)]
+    pub budget: BudgetSettings,
+    /// Address of the demo's publisher; port 0 takes a free one.
+    #[arg(long, default_value = "127.0.0.1:0")]
+    pub listen: SocketAddr,
+    #[command(flatten)]
+    pub output: OutputArgs,
+    #[command(flatten)]
+    pub surface: GaussiansArgs,
+}
+
+impl DemoArgs {
+    /// How the demo finds its person.
+    pub fn perception(&self) -> PerceptionSettings {
+        let Self { pose, masks, shape, .. } = *self;
+        PerceptionSettings { pose, masks, shape, ..PerceptionSettings::default() }
+    }
+}
 
 /// Cameras that go in, and cameras that are only rendered and compared.
 const INPUTS: [&str; 3] = ["00", "03", "05"];
@@ -75,7 +133,7 @@ struct Metrics {
 
 /// Runs the command.
 pub fn demo(args: &DemoArgs, gpu: &GpuContext) -> Result<()> {
-    std::fs::create_dir_all(&args.out).with_context(|| format!("cannot create {}", args.out.display()))?;
+    args.output.create()?;
     eprintln!("demo: simulated rig drawn by {}, people by {}", gpu.adapter_name(), gpu.fastest().adapter_name());
     let simulator = Arc::new(Mutex::new(Simulator::new(gpu, &sim_config(args)?)?));
 
@@ -85,7 +143,7 @@ pub fn demo(args: &DemoArgs, gpu: &GpuContext) -> Result<()> {
     })?;
     publisher.add_view("main")?;
     let endpoint = publisher.endpoints().first().context("the publisher listens nowhere")?.clone();
-    let viewer = Viewer::start(&args.out, &endpoint)?;
+    let viewer = Viewer::start(&args.output.out, &endpoint)?;
     let deadline = Instant::now() + VIEWER_DEADLINE;
     while !publisher.has_subscribers("main") && Instant::now() < deadline {
         std::thread::sleep(Duration::from_millis(50));
@@ -95,20 +153,12 @@ pub fn demo(args: &DemoArgs, gpu: &GpuContext) -> Result<()> {
     let main = pass(args, gpu, &simulator, &args.appearance, Some(publisher))?;
     let watch = viewer.finish();
     let main_mode = args.appearance.mode;
-    let mut modes = vec![(main_mode, main.sheet.per_camera(), main.sheet.mean())];
-    if args.ablation {
-        for mode in [AppearanceMode::Direct, AppearanceMode::DirectNoTime, AppearanceMode::DirectNoSpaceTime] {
-            if mode != main_mode && !stop::requested() {
-                let other = pass(args, gpu, &simulator, &AppearanceOptions::of_mode(mode), None)?;
-                modes.push((mode, other.sheet.per_camera(), other.sheet.mean()));
-            }
-        }
-    }
+    let modes = vec![(main_mode, main.sheet.per_camera(), main.sheet.mean())];
 
     let metrics = Metrics {
         adapter: gpu.fastest().adapter_name(),
         seed: args.seed,
-        gaussians: args.gaussians,
+        gaussians: args.surface.gaussians,
         frames: main.frames,
         seconds: main.seconds,
         frames_per_second: main.frames as f64 / (main.seconds - main.scoring_seconds).max(1e-9),
@@ -118,9 +168,9 @@ pub fn demo(args: &DemoArgs, gpu: &GpuContext) -> Result<()> {
         memory_mib: main.memory.clone(),
         watch,
     };
-    write_whole(&args.out.join("metrics.json"), &serde_json::to_vec_pretty(&metrics)?)?;
+    write_whole(&args.output.out.join("metrics.json"), &serde_json::to_vec_pretty(&metrics)?)?;
     let summary = summary(&metrics);
-    let path = args.out.join("index.html");
+    let path = args.output.out.join("index.html");
     report(&metrics, main, &summary).save(&path)?;
     for (mode, scores, mean) in &metrics.modes {
         println!("\n{mode:?}: three cameras in, four held out");
@@ -135,7 +185,7 @@ pub fn demo(args: &DemoArgs, gpu: &GpuContext) -> Result<()> {
     println!(
         "\nreport: {} (open it in a browser); the viewer's images: {}",
         path.display(),
-        args.out.join("watched").display()
+        args.output.out.join("watched").display()
     );
     Ok(())
 }
@@ -195,7 +245,7 @@ fn pass(
         .collect();
     let settings = SessionSettings {
         perception: args.perception(),
-        body: BodySettings { gaussians: args.gaussians, ..BodySettings::default() },
+        body: BodySettings { gaussians: args.surface.gaussians, ..BodySettings::default() },
         tracking: args.tracking.clone(),
         appearance: appearance.clone(),
         budget: args.budget,

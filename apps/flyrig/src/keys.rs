@@ -3,9 +3,84 @@
 use std::path::{Path, PathBuf};
 
 use anyhow::{Context as _, Result};
+use clap::{Args, Subcommand};
+use flyrig_access::DEFAULT_PORT;
 use flyrig_access::{Holder, KeyFile, Ring, Role};
 
-use crate::cli::{KeysAction, RingArgs};
+#[derive(Debug, Args)]
+pub struct RingArgs {
+    /// Folder of the rig's keys; the only one in this folder otherwise.
+    #[arg(long)]
+    pub ring: Option<PathBuf>,
+}
+
+/// A key to make.
+#[derive(Debug, Args)]
+pub struct NewKeyArgs {
+    /// Days after which it is refused.
+    #[arg(long, default_value_t = 365)]
+    pub days: u64,
+    /// The file; NAME.key otherwise.
+    #[arg(long)]
+    pub out: Option<PathBuf>,
+    #[command(flatten)]
+    pub ring: RingArgs,
+}
+
+#[derive(Debug, Subcommand)]
+pub enum KeysAction {
+    /// Make the folder of a rig's keys.
+    New {
+        /// Name of the rig, as rig.name in its configuration.
+        rig: String,
+        /// Name or address by which other computers reach this one; may be repeated.
+        #[arg(long = "host", required = true, value_name = "NAME")]
+        hosts: Vec<String>,
+        /// Port for viewers; cameras of other computers have the next.
+        #[arg(long, default_value_t = DEFAULT_PORT)]
+        port: u16,
+        /// The folder; RIG-keys otherwise.
+        #[arg(long)]
+        out: Option<PathBuf>,
+    },
+    /// Make a key: one file for its holder, who needs nothing else.
+    Add {
+        /// Name of the holder.
+        name: String,
+        /// Role: "viewer" watches, "cameras" sends camera images, "relay" watches and serves other viewers.
+        #[arg(long, default_value = "viewer", value_parser = parse_role)]
+        role: Role,
+        #[command(flatten)]
+        file: NewKeyArgs,
+    },
+    /// List everybody who was given a key.
+    List {
+        #[command(flatten)]
+        ring: RingArgs,
+    },
+    /// Make a new key of a holder; the old one is refused from then on.
+    Renew {
+        /// Name of the holder.
+        name: String,
+        #[command(flatten)]
+        file: NewKeyArgs,
+    },
+    /// Refuse a holder from now on; a running rig disconnects it within a second.
+    Revoke {
+        /// Name of the holder.
+        name: String,
+        #[command(flatten)]
+        ring: RingArgs,
+    },
+}
+
+fn parse_role(text: &str) -> Result<Role, String> {
+    let known = Role::ALL.map(Role::name);
+    Role::ALL
+        .into_iter()
+        .find(|role| role.name() == text)
+        .ok_or_else(|| format!("no such role; known: {}", known.join(", ")))
+}
 
 /// End of the names of folders of keys.
 const FOLDER_END: &str = "-keys";

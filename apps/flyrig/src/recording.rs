@@ -23,12 +23,36 @@ use foxglove::{
     messages::{CameraCalibration, FrameTransforms, Log},
 };
 
+use crate::arguments::{LagArgs, StopArgs};
 use crate::{
-    cli::{RecordArgs, ReplayArgs},
     config::{Config, RecordSection, SourceKind},
     live, pose_recording,
     source::{self, Source},
 };
+use clap::Args;
+use std::path::PathBuf;
+
+#[derive(Debug, Args)]
+pub struct RecordArgs {
+    /// The TOML file; see `flyrig config print`.
+    pub config: PathBuf,
+    /// The file; must not be there yet. Foxglove and other MCAP readers open it.
+    #[arg(long)]
+    pub out: PathBuf,
+    #[command(flatten)]
+    pub stop: StopArgs,
+}
+
+#[derive(Debug, Args)]
+pub struct ReplayArgs {
+    /// The MCAP file.
+    pub recording: PathBuf,
+    /// Write the synchronised images and the calibration into this new folder (EasyMocap layout).
+    #[arg(long)]
+    pub export: Option<PathBuf>,
+    #[command(flatten)]
+    pub lags: LagArgs,
+}
 
 /// Topics of the calibration in a recording, as on the network.
 const CALIBRATION: &str = "calibration/";
@@ -193,7 +217,7 @@ pub fn record(config: &Config, args: &RecordArgs, gpu: Option<&GpuContext>) -> R
     eprintln!("record: {} cameras to {} (Ctrl-C ends)", ids.len(), args.out.display());
     Monitor::ready();
     let (started, mut printed, mut has_ended) = (Instant::now(), Instant::now(), false);
-    let is_over = || args.seconds.is_some_and(|seconds| started.elapsed().as_secs_f64() >= seconds);
+    let is_over = || args.stop.seconds.is_some_and(|seconds| started.elapsed().as_secs_f64() >= seconds);
     while !stop.load(std::sync::atomic::Ordering::Relaxed) && !is_over() && recorder.state().problem.is_none() {
         // The frames are recorded on their way; here they are only taken out.
         match threads.queue().pop(Duration::from_millis(100)) {

@@ -5,13 +5,25 @@ use std::{
     time::Duration,
 };
 
+use crate::arguments::RigArgs;
 use anyhow::{Context as _, Result};
+use clap::Args;
 use flyrig_fusion::check_threads;
 use flyrig_report::stop;
 use flyrig_transport::{Relay, TransportConfig};
 use flyrig_web::{WebConfig, WebServer};
+use std::path::PathBuf;
 
-use crate::cli::ServeArgs;
+#[derive(Debug, Args)]
+pub struct ServeArgs {
+    #[command(flatten)]
+    pub rig: RigArgs,
+    /// Folder of keys of this relay (`flyrig keys new RIG --host THIS-COMPUTER`): their holders watch the rig through it with `flyrig view`.
+    #[arg(long, value_name = "FOLDER")]
+    pub keys: Option<PathBuf>,
+    #[command(flatten)]
+    pub web: WebConfig,
+}
 
 /// How often Ctrl-C is looked at.
 const TURN: Duration = Duration::from_millis(100);

@@ -3,11 +3,34 @@
 use std::time::Instant;
 
 use anyhow::Result;
+use clap::{Args, Subcommand};
 use flyrig_gpu::GpuContext;
 use flyrig_report::{progress_bar, stop};
 use flyrig_sim::{ExportOptions, SimConfig, Simulator, export};
+use std::path::PathBuf;
 
-use crate::cli::SimExportArgs;
+#[derive(Debug, Args)]
+pub struct SimExportArgs {
+    /// The TOML file whose [sim] section is simulated; the default configuration without one.
+    pub config: Option<PathBuf>,
+    /// Folder to write; must not be there yet.
+    #[arg(long)]
+    pub out: PathBuf,
+    /// Frames of every camera.
+    #[arg(long, default_value_t = 60, value_parser = clap::value_parser!(u64).range(1..=1_000_000))]
+    pub frames: u64,
+    /// Leave out depth, canonical positions, poses, surfaces and true times.
+    #[arg(long)]
+    pub no_truth: bool,
+}
+
+#[derive(Debug, Subcommand)]
+pub enum SimAction {
+    /// Print the default configuration of the simulated rig with a comment on every key.
+    Print,
+    /// Write a simulated capture as a folder that `flyrig eval` and other tools read (EasyMocap layout), with the truth.
+    Export(SimExportArgs),
+}
 
 /// Runs the command.
 pub fn sim_export(args: &SimExportArgs, config: &SimConfig, gpu: &GpuContext) -> Result<()> {

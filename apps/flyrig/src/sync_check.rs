@@ -11,11 +11,27 @@ use flyrig_sync::{
 };
 use flyrig_types::{CameraId, Image, Rig};
 
+use crate::arguments::parse_most_ms;
+use crate::arguments::{CalibrationArgs, InputArgs, SpanArgs};
 use crate::{
-    cli::SyncCheckArgs,
     silhouettes::Silhouettes,
     take::{self, CalibratedTake},
 };
+use clap::Args;
+
+#[derive(Debug, Args)]
+#[command(mut_arg("secs", |arg| arg.alias("seconds")))]
+pub struct SyncCheckArgs {
+    /// Largest time offset that is searched for, milliseconds.
+    #[arg(long, default_value_t = 250.0, value_parser = parse_most_ms)]
+    pub most_ms: f64,
+    #[command(flatten)]
+    pub source: InputArgs,
+    #[command(flatten)]
+    pub calibration: CalibrationArgs,
+    #[command(flatten)]
+    pub span: SpanArgs,
+}
 
 const ADD_TO_CAMERA: &str = "add it to the lag_ms that its [[source.cameras]] has (0 without one)";
 const ADD: &str = "add it to the camera's time_offset_ms in calibration.toml, or to [sync] lags_ms or --lag CAM=MS, which replace that";
@@ -23,7 +39,8 @@ const ADD: &str = "add it to the camera's time_offset_ms in calibration.toml, or
 /// Runs the command. `gpu` opens a graphics adapter, for simulated cameras alone.
 pub fn sync_check(args: &SyncCheckArgs, gpu: &dyn Fn() -> Result<GpuContext>) -> Result<()> {
     stop::flag();
-    let mut take = take::open_calibrated(&args.input, args.fps, args.calibration.as_deref(), gpu)?;
+    let mut take =
+        take::open_calibrated(&args.source.input, args.source.rate.fps, args.calibration.calibration.as_deref(), gpu)?;
     let cameras: Vec<CameraId> = take.sources.iter().map(|source| source.camera().clone()).collect();
     ensure!(cameras.len() > 1, "a time offset needs at least two cameras; name another one");
     let advice = if take.is_live { ADD_TO_CAMERA } else { ADD };
@@ -42,7 +59,7 @@ pub fn sync_check(args: &SyncCheckArgs, gpu: &dyn Fn() -> Result<GpuContext>) ->
                  tells no lag; record the take and check the recording"
             );
             if take.is_live {
-                eprintln!("sync-check: jump and wave both arms before all cameras for {} s, please", args.seconds);
+                eprintln!("sync-check: jump and wave both arms before all cameras for {} s, please", args.span.secs);
             }
             let (estimates, frames) = by_motion(args, take.sources, &cameras, &take.sync, take.is_live)?;
             let mend = "its motion does not correlate with that of other cameras, is too slow, or too short (under five seconds): jump and wave both \
@@ -82,7 +99,7 @@ fn by_motion(
             Ok(frame) => frame,
             Err(PopError::Closed) => break,
             Err(PopError::Timeout)
-                if is_live && started.elapsed().as_secs_f64() > args.from_secs + args.seconds + 5.0 =>
+                if is_live && started.elapsed().as_secs_f64() > args.span.from_secs + args.span.secs + 5.0 =>
             {
                 break;
             }
@@ -90,10 +107,10 @@ fn by_motion(
         };
         let from = *first.get_or_insert(frame.capture_nanos);
         let at = frame.capture_nanos.saturating_sub(from) as f64 * 1e-9;
-        if at > args.from_secs + args.seconds {
+        if at > args.span.from_secs + args.span.secs {
             break;
         }
-        if at < args.from_secs {
+        if at < args.span.from_secs {
             continue;
         }
         let image = &frame.image;
@@ -142,7 +159,7 @@ fn by_silhouettes(
         rig,
         take.sync,
         spread_nanos,
-        [args.from_secs, args.from_secs + args.seconds],
+        [args.span.from_secs, args.span.from_secs + args.span.secs],
         "silhouettes, ms of the take",
         |set| {
             set.present().for_each(|(slot, _)| pictures[slot] += 1);

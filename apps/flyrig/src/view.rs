@@ -1,11 +1,36 @@
 //! `flyrig view`: a window in which one walks around the people of a running rig.
 
+use crate::arguments::{RigArgs, StopArgs};
 use anyhow::Result;
+use clap::Args;
 use flyrig_gpu::GpuContext;
+use flyrig_report::arguments::parse_size;
 use flyrig_report::{png, write_whole};
 use flyrig_viewer::{ViewOptions, open_window};
+use std::path::PathBuf;
 
-use crate::cli::ViewArgs;
+#[derive(Debug, Args)]
+pub struct ViewArgs {
+    #[command(flatten)]
+    pub rig: RigArgs,
+    /// Show the newest frame at once; without it, motion is interpolated and shown a frame and a half later.
+    #[arg(long)]
+    pub lowest_latency: bool,
+    /// Move along with the person from the start (F).
+    #[arg(long)]
+    pub follow: bool,
+    /// Name of the rig's camera to stand at first.
+    #[arg(long)]
+    pub camera: Option<String>,
+    /// Size of the window, WIDTHxHEIGHT.
+    #[arg(long, value_parser = parse_size, default_value = "1280x720")]
+    pub size: [u32; 2],
+    /// Save the window as PNG as soon as a person is shown with all colours, and close it.
+    #[arg(long)]
+    pub screenshot: Option<PathBuf>,
+    #[command(flatten)]
+    pub stop: StopArgs,
+}
 
 /// Time for a screenshot, seconds, unless another one is given.
 const SCREENSHOT_SECS: f64 = 60.0;
@@ -19,7 +44,7 @@ pub fn view(args: &ViewArgs, gpu: &GpuContext) -> Result<()> {
         camera: args.camera.clone(),
         size: args.size,
         screenshot: args.screenshot.is_some(),
-        seconds: args.seconds.or(args.screenshot.is_some().then_some(SCREENSHOT_SECS)),
+        seconds: args.stop.seconds.or(args.screenshot.is_some().then_some(SCREENSHOT_SECS)),
     };
     let transport = &options.transport;
     eprintln!("view: rig '{}' at {}; close the window to end", transport.rig, transport.connect.join(", "));

@@ -11,7 +11,23 @@ use glam::DVec3;
 use serde_json::json;
 
 use super::{FILES, lens, page, refuse_existing, views::Seen};
-use crate::cli::CalibrateRigArgs;
+use crate::arguments::{BoardArgs, SolveArgs, TargetArgs};
+use clap::Args;
+
+#[derive(Debug, Args)]
+pub struct CalibrateRigArgs {
+    #[command(flatten)]
+    pub take: TakeArgs,
+    /// Solve for the lenses together with the poses.
+    #[arg(long)]
+    pub refine_lenses: bool,
+    #[command(flatten)]
+    pub board: BoardArgs,
+    #[command(flatten)]
+    pub solve: SolveArgs,
+    #[command(flatten)]
+    pub target: TargetArgs,
+}
 
 /// Name of the page about the calibration.
 pub(super) const PAGE: &str = "calibration.html";
@@ -37,14 +53,14 @@ pub(super) struct Target<'a> {
 /// Runs the command.
 pub fn rig(args: &CalibrateRigArgs, gpu: &dyn Fn() -> Result<GpuContext>) -> Result<()> {
     stop::flag();
-    let board = Board::load(&args.board)?;
-    refuse_existing(&args.out, &[&FILES[..], &[PAGE]].concat(), args.force)?;
+    let board = Board::load(&args.board.board)?;
+    refuse_existing(&args.target.out, &[&FILES[..], &[PAGE]].concat(), args.target.force)?;
     let seen = Seen::find(&args.take, &board, gpu)?;
     ensure!(seen.ids.len() > 1, "one camera alone is no rig; flyrig calibrate lens calibrates it");
-    check_floor(args.floor, &seen)?;
-    let lenses = lenses(args.lenses.as_deref(), &board, &seen)?;
+    check_floor(args.solve.floor, &seen)?;
+    let lenses = lenses(args.solve.lenses.as_deref(), &board, &seen)?;
     let refine = args.refine_lenses.then_some(LensModel::RadialTangential);
-    let target = Target { out: &args.out, floor: args.floor, no_offsets: args.no_offsets };
+    let target = Target { out: &args.target.out, floor: args.solve.floor, no_offsets: args.solve.no_offsets };
     solve_and_write(&target, &board, &seen, &lenses, refine)
 }
 

@@ -15,10 +15,23 @@ use flyrig_sync::SyncSettings;
 use flyrig_types::{CameraId, FrameSet};
 use rayon::prelude::*;
 
-use crate::{
-    cli::TakeArgs,
-    take::{self, Take},
-};
+use crate::arguments::InputArgs;
+use crate::arguments::parse_most_ms;
+use crate::take::{self, Take};
+use clap::Args;
+use flyrig_report::arguments::parse_seconds;
+
+#[derive(Debug, Args)]
+pub struct TakeArgs {
+    /// Seconds that are looked at.
+    #[arg(long, default_value_t = 120.0, value_parser = parse_seconds)]
+    pub secs: f64,
+    /// Time from one set that is looked at to the next, milliseconds.
+    #[arg(long, default_value_t = 100.0, value_parser = parse_most_ms)]
+    pub every_ms: f64,
+    #[command(flatten)]
+    pub source: InputArgs,
+}
 
 /// Images that are looked at together.
 const BATCH: usize = 16;
@@ -43,11 +56,12 @@ impl Seen {
     /// Opens a take and looks for the board; every camera must see it. `gpu` opens a graphics adapter, for simulated cameras alone.
     pub fn find(args: &TakeArgs, board: &Board, gpu: &dyn Fn() -> Result<GpuContext>) -> Result<Self> {
         let bar = progress_bar((args.secs * 1e3) as u64, "boards, ms of the take");
-        let seen = Self::look_through(take::open(&args.input, args.fps, gpu)?, board, args, |seen, at| {
-            bar.set_position((at * 1e3) as u64);
-            bar.set_message(format!("{} boards", seen.shots.iter().map(|shot| shot.views.len()).sum::<usize>()));
-            Ok(ControlFlow::Continue(()))
-        })?;
+        let seen =
+            Self::look_through(take::open(&args.source.input, args.source.rate.fps, gpu)?, board, args, |seen, at| {
+                bar.set_position((at * 1e3) as u64);
+                bar.set_message(format!("{} boards", seen.shots.iter().map(|shot| shot.views.len()).sum::<usize>()));
+                Ok(ControlFlow::Continue(()))
+            })?;
         bar.finish_and_clear();
         seen.check(board)?;
         Ok(seen)
