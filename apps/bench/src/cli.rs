@@ -40,41 +40,42 @@ pub struct BenchCli {
 /// Subcommands of `flyrig-bench`.
 #[derive(Debug, Subcommand)]
 pub enum BenchCommand {
-    /// Deformation tracking: solvers, iterations, Gaussians, resolution and views; writes CSV, JSON and SVG.
+    /// Deformation tracking: error over run time of solvers, iterations, Gaussians, resolutions and views. Writes CSV, JSON and SVG.
     Track(BenchTrackArgs),
-    /// Thousands of frames of one movement there and back: error and memory over time; writes CSV and SVG.
+    /// Deformation tracking over thousands of frames of one motion back and forth: error and memory over time. Writes CSV and SVG.
     Endure(BenchEndureArgs),
-    /// Appearance: every mode on simulated people that nobody trained on; writes CSV, JSON and SVG.
+    /// Appearance: every mode and ablation on simulated people outside of the training data. Writes CSV, JSON and SVG.
     Appearance(BenchAppearanceArgs),
-    /// Avatars: error against the time of their fit, time and memory by the number of Gaussians; writes a table, JSON and SVG.
+    /// Avatars: error over the time of the fit for its variants, run time and memory over the number of Gaussians. Writes a table, JSON
+    /// and SVG.
     Avatar(BenchAvatarArgs),
-    /// Budgets of time: what each kind of work that may be left out costs in views, and the run time it saves.
+    /// Budgets: error in views and saved run time of each kind of work that a budget may skip.
     Budget(BenchBudgetArgs),
-    /// Capture: memory, latency and processor time of plain cameras of this process, from their threads to whole sets.
+    /// Capture: memory, latency and processor time of plain cameras of this process, from their threads to frame sets.
     Capture(BenchCaptureArgs),
-    /// Fingertips and the head's rotation on simulated people, estimated and relaxed, and the cost of a crop.
+    /// Hands: errors of fingertips and of the head's rotation on simulated people, estimated and relaxed, and the run time per crop.
     Hands(BenchHandsArgs),
-    /// Bias and spread of the landmark network on people whose pose is known.
+    /// Landmarks: bias and spread of the landmark network on people whose pose is known.
     Landmarks(BenchLandmarksArgs),
-    /// Bumped cameras among switched lights, a walking person and exposure jumps: time to the report, error, false alarms, cost.
+    /// Bumped cameras among switched lights, a walking person and exposure jumps: delay of the report, error, false alarms, run time.
     Watch(BenchWatchArgs),
-    /// The person stream: bytes and run times against what it loses; writes a table, CSV, JSON and SVG.
+    /// Person stream: bytes, run times and losses, beside other encodings. Writes a table, CSV, JSON and SVG.
     Stream(BenchStreamArgs),
-    /// Receive the people of a rig, or of a take that `flyrig play --repeat` publishes: update rates, age, errors of the displayed views.
+    /// Reception of the people of a rig, or of a take that `flyrig play --repeat` publishes: update rates, age, errors of displayed views.
     Receive(BenchReceiveArgs),
     /// Masks estimated in each camera independently, against which several calibrations are scored.
     Masks(BenchMasksArgs),
-    /// Pose, shape and masks from images: errors, and what each of them costs in the views; writes a table and JSON.
+    /// Pose, shape and masks from images: their errors, and the error in the views that each causes. Writes a table and JSON.
     Perception(BenchPerceptionArgs),
     /// Turns, covered cameras, switched lights, people who leave: errors before, during and after, and the time to recover.
     Stress(BenchStressArgs),
-    /// Two people in one scene: views, and the cost beside one person; writes a table and PNG images.
+    /// Two or more people in one scene: views, and run time compared with one person. Writes a table and PNG images.
     Subjects(BenchSubjectsArgs),
-    /// Who is who: takes of several people who walk past one another, found and followed from images alone.
+    /// Identities: takes of several people who walk past one another, found and followed from images alone.
     Takes(BenchTakesArgs),
-    /// Run time and error by pixels, input cameras and Gaussians, and the exponents of the run time.
+    /// Run time and error over pixels, input cameras and Gaussians, and the exponents of the run time.
     Scale(BenchScaleArgs),
-    /// Recording uncompressed cameras: bytes, processor time and loss of each JPEG quality against images as they come.
+    /// Recordings of uncompressed cameras: bytes, processor time and loss of each JPEG quality.
     Record(BenchRecordArgs),
 }
 

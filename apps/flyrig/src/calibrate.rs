@@ -17,21 +17,22 @@ use anyhow::{Result, bail};
 use clap::Subcommand;
 use flyrig_gpu::GpuContext;
 
+/// Subcommands of `flyrig calibrate`.
 #[derive(Debug, Subcommand)]
 pub enum CalibrateAction {
-    /// Write a board to print (SVG, PDF) and its description, board.toml.
+    /// Write a printable board (SVG, PDF) and its description, board.toml.
     Board(board::CalibrateBoardArgs),
-    /// Calibrate the lens of each camera from a take in which it sees the board in many poses.
+    /// Calibrate the lens of each camera from a take with many poses of the board.
     Lens(lens::CalibrateLensArgs),
-    /// Calibrate the poses, and time offsets, of all cameras from a take in which they see the board together.
+    /// Calibrate poses and time offsets of all cameras from a take in which they see the board together.
     Rig(rig::CalibrateRigArgs),
-    /// Calibrate lenses and poses while the board is shown, with hints what to show next, in the terminal and on a local page.
+    /// Calibrate lenses and poses while the board is shown, with instructions in the terminal and on a local page.
     Live(live::CalibrateLiveArgs),
-    /// Refine poses and time offsets of calibrated cameras from one person who moves before them.
+    /// Refine poses and time offsets of calibrated cameras from the motion of one person.
     Person(person::CalibratePersonArgs),
-    /// Match the colours of calibrated cameras: exposure, white balance, response and vignetting, from people before them.
+    /// Match the colours of calibrated cameras (exposure, white balance, response, vignetting) from people in view.
     Color(color::CalibrateColorArgs),
-    /// Convert a calibration of another program, or to one.
+    /// Convert a calibration from or to the format of another program.
     Convert(convert::CalibrateConvertArgs),
 }
 

@@ -24,8 +24,8 @@ use crate::{
 /// Live free-viewpoint video of a person from a few cameras.
 ///
 /// Start with `flyrig demo`: it runs a simulated rig, publishes the result, watches it from a second process and
-/// writes a report with images. `flyrig eval` does the same honestly on a data set of yours. For a rig that stays
-/// up, print a configuration, edit it and run it:
+/// writes a report with images. `flyrig eval` scores a data set of yours against held-out cameras. For a permanent
+/// rig, print a configuration, edit it and run it:
 ///
 ///     flyrig doctor
 ///     flyrig config print > rig.toml
@@ -35,13 +35,13 @@ use crate::{
 #[derive(Debug, Parser)]
 #[command(version, verbatim_doc_comment)]
 pub struct Cli {
-    /// Log as one JSON object a line.
+    /// Log one JSON object per line.
     #[arg(long, global = true)]
     pub log_json: bool,
-    /// Log more: -v debug, -vv trace. RUST_LOG chooses in detail.
+    /// Log more: -v debug, -vv trace. RUST_LOG selects modules.
     #[arg(short, long, global = true, action = clap::ArgAction::Count)]
     pub verbose: u8,
-    /// Part of a graphics adapter's name; the fastest one otherwise.
+    /// Part of a graphics adapter's name; the fastest adapter otherwise.
     #[arg(long, global = true)]
     pub adapter: Option<String>,
     /// Write when each stage ran into this file, for Perfetto (ui.perfetto.dev) or about:tracing.
@@ -57,65 +57,64 @@ pub enum Command {
     Demo(DemoArgs),
     /// Run a rig from a configuration until Ctrl-C.
     Run {
-        /// The TOML file; see `flyrig config print`.
+        /// Configuration (TOML); see `flyrig config print`.
         config: PathBuf,
-        /// Record the cameras into this MCAP file meanwhile; it must not be there yet.
+        /// Record the cameras into this new MCAP file as well.
         #[arg(long)]
         record: Option<PathBuf>,
-        /// Show a live table of the cameras in place of a line of rates.
+        /// Show a live table of the cameras instead of a line of rates.
         #[arg(long)]
         table: bool,
     },
-    /// Send the cameras of this computer to a rig that runs on another one (source.kind = "network" there) until Ctrl-C. Of
-    /// the configuration [rig], [source], [capture], [transport] and [health] count; V4L2 cameras need no calibration.
+    /// Send the cameras of this computer to a rig on another one (source.kind = "network" there) until Ctrl-C. Uses the tables [rig],
+    /// [source], [capture], [transport] and [health] of the configuration; V4L2 cameras need no calibration.
     Capture {
-        /// The TOML file; see `flyrig config print`.
+        /// Configuration (TOML); see `flyrig config print`.
         config: PathBuf,
-        /// Key of role "cameras" (`flyrig keys add`): connects to its rig, wherever that is, and listens nowhere.
+        /// Key of role "cameras" (`flyrig keys add`): connect to its rig, and do not listen.
         #[arg(long)]
         key: Option<PathBuf>,
     },
     /// Record the cameras of a configuration into an MCAP file, without tracking.
     Record(RecordArgs),
-    /// Play a recording through, summarise its contents, and export it where asked to. To run the rig on it, set
-    /// source.kind = "mcap".
+    /// Read a recording, print a summary, and export it with --export. To run the rig on it, set source.kind = "mcap".
     Replay(ReplayArgs),
-    /// Estimate each camera's time offset from the first camera: from the silhouettes of a person where the calibration is
-    /// known (recordings, folders), else from motion in the images (live cameras).
+    /// Estimate each camera's time offset from the first camera: from silhouettes of a person where the calibration is known
+    /// (recordings, folders), otherwise from motion in the images (live cameras).
     SyncCheck(SyncCheckArgs),
-    /// Record the empty scene before each camera (plates): masks are then made from the difference to it.
+    /// Record images of the empty scene (plates), from which masks are computed by difference.
     Plate(PlateArgs),
     /// Calibrate a rig: print a board, then calibrate lenses and poses from a take that shows it.
     Calibrate {
         #[command(subcommand)]
         action: CalibrateAction,
     },
-    /// List cameras with their identifiers, formats and buses, and graphics adapters; suggest fixes.
+    /// List cameras with identifiers, formats and buses, and graphics adapters; suggest fixes of problems.
     Doctor {
-        /// A TOML file whose cameras are looked for and whose buses are planned.
+        /// Configuration whose cameras are checked, with the bandwidth of their buses.
         config: Option<PathBuf>,
     },
-    /// Walk around the people of a running rig, in a window.
+    /// Show the people of a running rig in a window, from freely chosen viewpoints.
     View(ViewArgs),
-    /// Serve a web page on which browsers show the people of a running rig. `flyrig run` does it too, where web.listen is set.
+    /// Serve a web page on which browsers show the people of a running rig. `flyrig run` serves it as well where web.listen is set.
     Serve(ServeArgs),
-    /// Give keys to those who may connect to a rig from other computers: viewers, cameras, relays.
+    /// Manage the keys with which viewers, cameras and relays connect to a rig from other computers.
     Keys {
         #[command(subcommand)]
         action: KeysAction,
     },
-    /// Publish a recorded person stream again, at its own pace, to try viewers without a rig.
+    /// Publish a recorded person stream at its original pace, to test viewers without a rig.
     Play(PlayArgs),
-    /// Watch a running rig: print rates and latency, write images or a video.
+    /// Print rates and latency of a running rig, write images or a video.
     Watch(WatchArgs),
     /// Replay a data set, render its held-out cameras and score them.
     Eval(EvalArgs),
-    /// Build a person's avatar, score it, drive it by recorded motion, export it.
+    /// Build the avatar of a person, score it, drive it by recorded motion, export it.
     Avatar {
         #[command(subcommand)]
         action: AvatarAction,
     },
-    /// Use the simulated rig by itself.
+    /// Print the default configuration of the simulated rig, or export a simulated capture.
     Sim {
         #[command(subcommand)]
         action: SimAction,
@@ -133,9 +132,9 @@ pub enum Command {
 pub enum ConfigAction {
     /// Print the default configuration with a comment on every key.
     Print,
-    /// Read a configuration and say whether it is right.
+    /// Check a configuration, and the simulator's file that it names.
     Check {
-        /// The TOML file.
+        /// Configuration (TOML).
         config: PathBuf,
     },
 }

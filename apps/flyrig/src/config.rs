@@ -16,7 +16,7 @@ use serde::{Deserialize, Serialize};
 
 use crate::{cameras::CameraEntry, simulator_file, toml_errors::explain};
 
-/// The commented default file, as `flyrig config print` writes it. A test keeps it equal to `Config::default()`.
+/// Commented default file, as `flyrig config print` writes it; a test keeps it equal to `Config::default()`.
 pub const DEFAULT_TOML: &str = include_str!("../assets/default.toml");
 
 /// Tables and keys of earlier versions, and what to do about each.
@@ -62,14 +62,14 @@ pub struct Config {
     pub gpu: GpuSection,
 }
 
-/// How the calibration is looked after while the rig runs.
+/// Supervision of the calibration while the rig runs.
 #[derive(Debug, Clone, PartialEq, Default, Serialize, Deserialize)]
 #[serde(deny_unknown_fields, default)]
 pub struct CalibrationSection {
     pub watch: WatchMode,
 }
 
-/// Whether cameras are watched for bumps.
+/// Reaction to bumped cameras.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize)]
 #[serde(rename_all = "lowercase")]
 pub enum WatchMode {
@@ -104,7 +104,7 @@ pub enum SourceKind {
 }
 
 impl SourceKind {
-    /// Whether frames come when they are taken, with the time of this computer.
+    /// Whether frames arrive at their capture times, with the clock of this computer.
     pub fn is_live(self) -> bool {
         matches!(self, Self::Cameras | Self::Network)
     }
@@ -122,18 +122,18 @@ pub struct SourceSection {
 }
 
 impl SourceSection {
-    /// Names of the chosen cameras; none for all.
+    /// Returns the names of the chosen cameras; empty for all.
     pub fn names(&self) -> Vec<String> {
         self.cameras.iter().map(|entry| entry.name().to_owned()).collect()
     }
 
-    /// Folder of the calibration; `None` where the recording holds it.
+    /// Returns the folder of the calibration; `None` where the recording contains it.
     pub fn calibration_folder(&self) -> Option<&Path> {
         let named = Some(self.calibration.as_path()).filter(|folder| !folder.as_os_str().is_empty());
         named.or((self.kind != SourceKind::Mcap).then_some(self.path.as_path()))
     }
 
-    /// Whether a calibration is named or lies in the folder. One that is damaged is there, too.
+    /// Whether a calibration is named or exists in the folder, even a damaged one.
     pub fn has_calibration(&self) -> bool {
         let holds = |folder: &Path| {
             ["calibration.toml", "intri.yml", "extri.yml"].iter().any(|file| folder.join(file).exists())
@@ -187,7 +187,7 @@ impl Default for SourceSection {
     }
 }
 
-/// What `flyrig capture` sends.
+/// Settings of `flyrig capture`.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields, default)]
 pub struct CaptureSection {
@@ -200,7 +200,7 @@ impl Default for CaptureSection {
     }
 }
 
-/// What recordings hold.
+/// Settings of recordings.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields, default)]
 pub struct RecordSection {
@@ -310,7 +310,7 @@ impl Config {
         self.transport().validate().context("in [rig] or [transport]")
     }
 
-    /// The settings of a session.
+    /// Returns the settings of a session.
     pub fn session(&self) -> SessionSettings {
         SessionSettings {
             perception: self.perception.clone(),
@@ -321,12 +321,15 @@ impl Config {
         }
     }
 
-    /// The settings of the transport session.
+    /// Returns the settings of the transport session.
     pub fn transport(&self) -> TransportConfig {
         TransportConfig { rig: self.rig.name.clone(), ..self.transport.clone() }
     }
 
-    /// What tracking needs beyond values in their ranges.
+    /// Checks the requirements of tracking beyond the ranges of the values.
+    ///
+    /// # Errors
+    /// Names the missing key and what to do.
     pub fn check_scene(&self) -> Result<()> {
         ensure!(
             self.source.kind == SourceKind::Sim
@@ -384,7 +387,7 @@ mod tests {
         assert_eq!(Config::parse(DEFAULT_TOML).unwrap(), Config::default());
         assert_eq!(Config::parse("").unwrap(), Config::default());
         let all = toml::Table::try_from(Config::default()).unwrap();
-        // It stands there as a comment, since it would exclude tables of real cameras.
+        // A comment in the file: the key would exclude tables of real cameras.
         let names = "# cameras = [\"00\", \"03\", \"05\"]\n";
         assert_eq!(missing_keys(&all, &DEFAULT_TOML.parse().unwrap(), ""), ["source.cameras"]);
         let uncommented = DEFAULT_TOML.replace(names, &names[2..]);

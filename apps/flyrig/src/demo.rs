@@ -37,29 +37,29 @@ use std::path::PathBuf;
 #[derive(Debug, Args)]
 #[command(mut_arg("out", |arg| arg.default_value("out/demo")))]
 pub struct DemoArgs {
-    /// Frames of the simulated rig.
+    /// Number of frames.
     #[arg(long, default_value_t = 60, conflicts_with = "minutes")]
     pub frames: usize,
-    /// Run for so long instead, the motion repeating.
+    /// Duration in minutes instead of frames; the motion repeats.
     #[arg(long, value_parser = parse_minutes)]
     pub minutes: Option<f64>,
-    /// Seed of the person and the room.
+    /// Seed of person and room.
     #[arg(long, default_value_t = 1)]
     pub seed: u64,
-    /// "turn", "walk", "wave", "squat", "reach", "sit", "lie", "jump", "cross-arms", "dance", "still", "by-seed", "bvh" (a captured
+    /// Motion: "turn", "walk", "wave", "squat", "reach", "sit", "lie", "jump", "cross-arms", "dance", "still", "by-seed", "bvh" (a captured
     /// walk from Debian's assimp-testmodels), or a *.bvh, *.glb or *.gltf file.
     #[arg(long, default_value = "turn")]
     pub motion: String,
-    /// TOML file with faults of cameras and clocks, like sim/assets/faults.toml.
+    /// File with faults of cameras and clocks (TOML), such as sim/assets/faults.toml.
     #[arg(long)]
     pub faults: Option<PathBuf>,
-    /// Pose from the images, or from the simulator.
+    /// Source of the pose: the images, or the simulator.
     #[arg(long, value_enum, default_value = "estimated")]
     pub pose: Origin,
-    /// Masks from the images and the empty room, or from the simulator.
+    /// Source of the masks: the images and the empty room, or the simulator.
     #[arg(long, value_enum, default_value = "estimated")]
     pub masks: Origin,
-    /// Shape of the body from the images, or from the simulator; by default from where the pose comes.
+    /// Source of the body's shape: the images, or the simulator; by default that of the pose.
     #[arg(long, value_enum)]
     pub shape: Option<Origin>,
     #[command(flatten)]
@@ -68,7 +68,7 @@ pub struct DemoArgs {
     pub appearance: AppearanceOptions,
     #[command(flatten)]
     pub budget: BudgetSettings,
-    /// Address of the demo's publisher; port 0 takes a free one.
+    /// Address of the publisher; port 0 selects a free port.
     #[arg(long, default_value = "127.0.0.1:0")]
     pub listen: SocketAddr,
     #[command(flatten)]
@@ -78,7 +78,7 @@ pub struct DemoArgs {
 }
 
 impl DemoArgs {
-    /// How the demo finds its person.
+    /// Returns the settings of the perception.
     pub fn perception(&self) -> PerceptionSettings {
         let Self { pose, masks, shape, .. } = *self;
         PerceptionSettings { pose, masks, shape, ..PerceptionSettings::default() }
@@ -396,7 +396,7 @@ fn score(
 /// `flyrig watch` as a child process.
 struct Viewer {
     child: Child,
-    stats: std::path::PathBuf,
+    stats: PathBuf,
 }
 
 impl Viewer {

@@ -30,12 +30,12 @@ pub struct EvalArgs {
     pub take: DatasetArgs,
     #[command(flatten)]
     pub holdout: HoldoutArgs,
-    /// Folder for images, surfaces and the report.
+    /// Folder of images, surfaces and the report.
     #[arg(long)]
     pub out: PathBuf,
     #[command(flatten)]
     pub body: BodySettings,
-    /// The person's avatar (`flyrig avatar build`): tracking and colours start from it.
+    /// Avatar of the person (`flyrig avatar build`), from which tracking and colours start.
     #[arg(long, value_name = "FILE")]
     pub avatar: Option<PathBuf>,
     #[command(flatten)]

@@ -9,41 +9,42 @@ use flyrig_access::{Holder, KeyFile, Ring, Role};
 
 #[derive(Debug, Args)]
 pub struct RingArgs {
-    /// Folder of the rig's keys; the only one in this folder otherwise.
+    /// Folder of the rig's keys; the only such folder in the current one otherwise.
     #[arg(long)]
     pub ring: Option<PathBuf>,
 }
 
-/// A key to make.
+/// Arguments of a new key.
 #[derive(Debug, Args)]
 pub struct NewKeyArgs {
-    /// Days after which it is refused.
+    /// Validity, days.
     #[arg(long, default_value_t = 365)]
     pub days: u64,
-    /// The file; NAME.key otherwise.
+    /// File of the key; NAME.key otherwise.
     #[arg(long)]
     pub out: Option<PathBuf>,
     #[command(flatten)]
     pub ring: RingArgs,
 }
 
+/// Subcommands of `flyrig keys`.
 #[derive(Debug, Subcommand)]
 pub enum KeysAction {
-    /// Make the folder of a rig's keys.
+    /// Create the folder of a rig's keys.
     New {
         /// Name of the rig, as rig.name in its configuration.
         rig: String,
-        /// Name or address by which other computers reach this one; may be repeated.
+        /// Name or address by which other computers reach this computer; may be repeated.
         #[arg(long = "host", required = true, value_name = "NAME")]
         hosts: Vec<String>,
-        /// Port for viewers; cameras of other computers have the next.
+        /// Port for viewers; cameras of other computers use the next one.
         #[arg(long, default_value_t = DEFAULT_PORT)]
         port: u16,
-        /// The folder; RIG-keys otherwise.
+        /// New folder; RIG-keys otherwise.
         #[arg(long)]
         out: Option<PathBuf>,
     },
-    /// Make a key: one file for its holder, who needs nothing else.
+    /// Create a key: a single file, which is all that its holder needs.
     Add {
         /// Name of the holder.
         name: String,
@@ -53,12 +54,12 @@ pub enum KeysAction {
         #[command(flatten)]
         file: NewKeyArgs,
     },
-    /// List everybody who was given a key.
+    /// List the holders of keys.
     List {
         #[command(flatten)]
         ring: RingArgs,
     },
-    /// Make a new key of a holder; the old one is refused from then on.
+    /// Create a new key for a holder, and refuse the old one from now on.
     Renew {
         /// Name of the holder.
         name: String,

@@ -21,7 +21,7 @@ use flyrig_report::arguments::{FpsArgs, parse_seconds};
 pub struct PlateArgs {
     /// A configuration (*.toml), a recording (*.mcap) or a folder with images/CAM.
     pub input: PathBuf,
-    /// Seconds over which each pixel's median is taken.
+    /// Seconds of the median of each pixel.
     #[arg(long, default_value_t = 3.0, value_parser = parse_seconds)]
     pub secs: f64,
     #[command(flatten)]

@@ -34,9 +34,9 @@ use std::path::PathBuf;
 
 #[derive(Debug, Args)]
 pub struct RecordArgs {
-    /// The TOML file; see `flyrig config print`.
+    /// Configuration (TOML); see `flyrig config print`.
     pub config: PathBuf,
-    /// The file; must not be there yet. Foxglove and other MCAP readers open it.
+    /// New MCAP file, which Foxglove and other readers open.
     #[arg(long)]
     pub out: PathBuf,
     #[command(flatten)]
@@ -47,7 +47,7 @@ pub struct RecordArgs {
 pub struct ReplayArgs {
     /// The MCAP file.
     pub recording: PathBuf,
-    /// Write the synchronised images and the calibration into this new folder (EasyMocap layout).
+    /// Write the synchronized images and the calibration into this new folder (EasyMocap layout).
     #[arg(long)]
     pub export: Option<PathBuf>,
     #[command(flatten)]

@@ -18,7 +18,7 @@ use std::path::PathBuf;
 pub struct ServeArgs {
     #[command(flatten)]
     pub rig: RigArgs,
-    /// Folder of keys of this relay (`flyrig keys new RIG --host THIS-COMPUTER`): their holders watch the rig through it with `flyrig view`.
+    /// Folder of the keys of this relay (`flyrig keys new RIG --host THIS-COMPUTER`), whose holders watch the rig through it with `flyrig view`.
     #[arg(long, value_name = "FOLDER")]
     pub keys: Option<PathBuf>,
     #[command(flatten)]

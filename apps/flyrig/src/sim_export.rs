@@ -11,24 +11,25 @@ use std::path::PathBuf;
 
 #[derive(Debug, Args)]
 pub struct SimExportArgs {
-    /// The TOML file whose [sim] section is simulated; the default configuration without one.
+    /// Configuration of the simulated rig (TOML), as `flyrig sim print` prints it; its defaults otherwise.
     pub config: Option<PathBuf>,
-    /// Folder to write; must not be there yet.
+    /// New folder of the capture.
     #[arg(long)]
     pub out: PathBuf,
-    /// Frames of every camera.
+    /// Number of frames of every camera.
     #[arg(long, default_value_t = 60, value_parser = clap::value_parser!(u64).range(1..=1_000_000))]
     pub frames: u64,
-    /// Leave out depth, canonical positions, poses, surfaces and true times.
+    /// Skip the ground truth: depth, canonical positions, poses, surfaces and true times.
     #[arg(long)]
     pub no_truth: bool,
 }
 
+/// Subcommands of `flyrig sim`.
 #[derive(Debug, Subcommand)]
 pub enum SimAction {
     /// Print the default configuration of the simulated rig with a comment on every key.
     Print,
-    /// Write a simulated capture as a folder that `flyrig eval` and other tools read (EasyMocap layout), with the truth.
+    /// Write a simulated capture in the layout of EasyMocap, which `flyrig eval` reads, with the ground truth.
     Export(SimExportArgs),
 }
 

@@ -26,25 +26,25 @@ use std::path::PathBuf;
 pub struct PlayArgs {
     /// Recording of `flyrig watch --record`.
     pub recording: PathBuf,
-    /// Name of the rig that it is published as.
+    /// Name of the published rig.
     #[arg(long, default_value = "flyrig")]
     pub rig: String,
-    /// Where viewers of this computer connect (zenoh endpoint).
+    /// Address for viewers of this computer (zenoh endpoint).
     #[arg(long, default_value = "tcp/127.0.0.1:7447")]
     pub listen: String,
-    /// Folder of the rig's keys: their holders connect from other computers.
+    /// Folder of the rig's keys, whose holders connect from other computers.
     #[arg(long)]
     pub keys: Option<PathBuf>,
-    /// Listen on addresses that other computers reach without keys: in trusted networks only.
+    /// Allow addresses that other computers reach without keys: in trusted networks only.
     #[arg(long)]
     pub insecure: bool,
-    /// Begin again at the end, until Ctrl-C.
+    /// Repeat until Ctrl-C.
     #[arg(long)]
     pub repeat: bool,
-    /// Begin when the first viewer is there.
+    /// Wait for the first viewer.
     #[arg(long)]
     pub wait: bool,
-    /// Pace against that of the recording.
+    /// Pace relative to that of the recording.
     #[arg(long, default_value_t = 1.0, value_parser = parse_speed)]
     pub speed: f64,
 }

@@ -22,7 +22,7 @@ use clap::Args;
 #[derive(Debug, Args)]
 #[command(mut_arg("secs", |arg| arg.alias("seconds")))]
 pub struct SyncCheckArgs {
-    /// Largest time offset that is searched for, milliseconds.
+    /// Largest time offset of the search, milliseconds.
     #[arg(long, default_value_t = 250.0, value_parser = parse_most_ms)]
     pub most_ms: f64,
     #[command(flatten)]
@@ -180,6 +180,7 @@ fn by_silhouettes(
 mod tests {
     use flyrig_capture::CameraSource as _;
     use flyrig_gpu::AdapterChoice;
+    use flyrig_report::arguments::FpsArgs;
     use flyrig_report::dataset;
     use flyrig_sim::{Fault, FaultKind, FaultScript, MotionConfig, MotionKind, SimConfig, SimTime, Simulator};
     use rand::{RngExt as _, SeedableRng as _, rngs::SmallRng};
@@ -258,7 +259,12 @@ mod tests {
     }
 
     fn args() -> SyncCheckArgs {
-        SyncCheckArgs { input: Vec::new(), seconds: 20.0, from_secs: 0.0, most_ms: 250.0, fps: 30.0, calibration: None }
+        SyncCheckArgs {
+            most_ms: 250.0,
+            source: InputArgs { input: Vec::new(), rate: FpsArgs { fps: 30.0 } },
+            calibration: CalibrationArgs { calibration: None },
+            span: SpanArgs { secs: 20.0, from_secs: 0.0 },
+        }
     }
 
     #[test]

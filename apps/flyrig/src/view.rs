@@ -13,19 +13,19 @@ use std::path::PathBuf;
 pub struct ViewArgs {
     #[command(flatten)]
     pub rig: RigArgs,
-    /// Show the newest frame at once; without it, motion is interpolated and shown a frame and a half later.
+    /// Show the newest frame immediately; otherwise motion is interpolated with a delay of 1.5 frames.
     #[arg(long)]
     pub lowest_latency: bool,
-    /// Move along with the person from the start (F).
+    /// Follow the person from the start (key F).
     #[arg(long)]
     pub follow: bool,
-    /// Name of the rig's camera to stand at first.
+    /// Name of the rig's camera at which the view starts.
     #[arg(long)]
     pub camera: Option<String>,
     /// Size of the window, WIDTHxHEIGHT.
     #[arg(long, value_parser = parse_size, default_value = "1280x720")]
     pub size: [u32; 2],
-    /// Save the window as PNG as soon as a person is shown with all colours, and close it.
+    /// Save the window as PNG once a person is shown with complete colours, and close it.
     #[arg(long)]
     pub screenshot: Option<PathBuf>,
     #[command(flatten)]

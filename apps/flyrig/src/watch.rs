@@ -28,13 +28,13 @@ use serde::{Deserialize, Serialize};
 pub struct WatchArgs {
     #[command(flatten)]
     pub rig: RigArgs,
-    /// A published view; or ask for one of your own with --eye.
+    /// Name of a published view; --eye requests a viewpoint instead.
     #[arg(long, default_value = "main")]
     pub view: String,
-    /// Ask for a viewpoint of your own: camera position x,y,z in metres of the rig's world.
+    /// Request a viewpoint: camera position x,y,z, metres in the world of the rig.
     #[arg(long, value_parser = parse_vec3, allow_hyphen_values = true)]
     pub eye: Option<[f64; 3]>,
-    /// Point that the viewpoint of --eye looks at.
+    /// Point at which the viewpoint of --eye is aimed.
     #[arg(long, value_parser = parse_vec3, allow_hyphen_values = true, default_value = "0,0,1")]
     pub target: [f64; 3],
     /// Size of the viewpoint of --eye, WIDTHxHEIGHT.
@@ -43,16 +43,16 @@ pub struct WatchArgs {
     /// Vertical field of view of the viewpoint of --eye, degrees.
     #[arg(long, default_value_t = 40.0)]
     pub fov_degrees: f64,
-    /// Most images a second of the viewpoint of --eye; viewers share the rig's budget of pixels a second.
+    /// Largest frame rate of the viewpoint of --eye; viewers share the rig's budget of pixels per second.
     #[arg(long, default_value_t = 30.0)]
     pub max_fps: f64,
-    /// Write every image as PNG into this folder, or, when the name ends in .mp4 or .avi, a video.
+    /// Write every image as PNG into this folder, or a video if the name ends in .mp4 or .avi.
     #[arg(long)]
     pub out: Option<PathBuf>,
-    /// Record the person stream into this file (MCAP), for `flyrig play`; no images are received then.
+    /// Record the person stream into this MCAP file, for `flyrig play`, without receiving images.
     #[arg(long, conflicts_with_all = ["out", "eye", "count", "stats"])]
     pub record: Option<PathBuf>,
-    /// Stop after so many images.
+    /// Stop after this many images.
     #[arg(long)]
     pub count: Option<usize>,
     /// Stop when the rig ends its session.

@@ -1,4 +1,4 @@
-//! `flyrig-bench appearance`: how well every way of colouring paints people that nobody trained on, and what it takes.
+//! `flyrig-bench appearance`: error and run time of every appearance mode on people outside of the training data.
 
 use std::{
     fmt::Write as _,
@@ -7,7 +7,7 @@ use std::{
 
 use crate::harness::{
     arguments::SimulationArgs,
-    sequence::{Motion, Sequence, SequenceConfig},
+    sequence::{SequenceConfig, SequenceMotion, SimulatedSequence},
 };
 use anyhow::{Context, Result};
 use clap::ValueEnum as _;
@@ -31,7 +31,7 @@ use serde::Serialize;
 #[derive(Debug, Args)]
 #[command(mut_arg("out", |arg| arg.default_value("out/bench-appearance")), mut_arg("seed", |arg| arg.default_value("101")))]
 pub struct BenchAppearanceArgs {
-    /// How many people.
+    /// Number of people.
     #[arg(long, default_value_t = 4, value_parser = clap::value_parser!(u64).range(1..=1000))]
     pub people: u64,
     /// Frames of each sequence; the second half is scored.
@@ -40,10 +40,10 @@ pub struct BenchAppearanceArgs {
     /// Numbers of input cameras, comma separated.
     #[arg(long, value_delimiter = ',', default_value = "3,1", value_parser = clap::value_parser!(u8).range(1..=6).map(usize::from))]
     pub views: Vec<usize>,
-    /// Weights files of the learned modes, in place of all networks that come with flyrig; may be given several times.
+    /// Weights files for the learned modes, in place of all networks that come with flyrig; may be repeated.
     #[arg(long)]
     pub weights: Vec<PathBuf>,
-    /// Reuse of the networks' results from frame to frame: see `reuse` in the configuration.
+    /// Largest change of an input for which the result of the networks is reused in the next frame; 0 recomputes everything.
     #[arg(long, default_value_t = 0.0)]
     pub reuse: f32,
     /// Where the networks run; "adapter" needs a program that was built with the feature gpu-networks.
@@ -57,7 +57,7 @@ pub struct BenchAppearanceArgs {
     pub surface: GaussiansArgs,
 }
 
-/// What came out for one person, one number of views and one mode.
+/// Result for one person, number of views and mode.
 #[derive(Debug, Clone, Serialize)]
 struct Row {
     person: u64,
@@ -66,9 +66,9 @@ struct Row {
     psnr_db: f64,
     ssim: f64,
     flip: f64,
-    /// Mean change of a Gaussian's sRGB value from frame to frame, of 255.
+    /// Mean change of a Gaussian's sRGB value from frame to frame, in units of 1/255.
     flicker: f64,
-    /// Milliseconds a frame: direct appearance, and the networks.
+    /// Milliseconds per frame of direct appearance and of the networks.
     direct_ms: f64,
     networks_ms: f64,
 }
@@ -89,13 +89,13 @@ pub fn appearance(args: &BenchAppearanceArgs, gpu: &GpuContext) -> Result<()> {
     let mut rows = Vec::new();
     for person in args.simulation.seed..args.simulation.seed.saturating_add(args.people) {
         let config = SequenceConfig {
-            motion: Motion::Turn,
+            motion: SequenceMotion::Turn,
             seed: person,
             side: args.simulation.side,
             frames: args.frames,
             fps: 30.0,
         };
-        let sequence = Sequence::simulate(gpu, config)?;
+        let sequence = SimulatedSequence::simulate(gpu, config)?;
         for &views in &args.views {
             for mode in &modes {
                 let row = run(gpu, args, &sequence, person, views, mode)?;
@@ -119,7 +119,7 @@ pub fn appearance(args: &BenchAppearanceArgs, gpu: &GpuContext) -> Result<()> {
 fn run(
     gpu: &GpuContext,
     args: &BenchAppearanceArgs,
-    sequence: &Sequence,
+    sequence: &SimulatedSequence,
     person: u64,
     views: usize,
     mode: &Mode<'_>,
@@ -174,7 +174,7 @@ fn run(
     })
 }
 
-/// A way of colouring, and the networks of the learned ones with their name.
+/// An appearance mode, with name and weights of the networks of learned modes.
 #[derive(Clone, Copy)]
 struct Mode<'a> {
     mode: AppearanceMode,
@@ -192,7 +192,7 @@ impl Mode<'_> {
     }
 }
 
-/// Name and weights of these files, or of all networks that come with the program; files are named where there are several.
+/// Returns name and weights of the files, or of all networks that come with the program; a single file has an empty name.
 fn networks(files: &[PathBuf]) -> Vec<(String, PathBuf)> {
     if files.is_empty() {
         return EMBEDDED.iter().map(|(name, _)| ((*name).to_owned(), PathBuf::from(name))).collect();
@@ -204,7 +204,7 @@ fn networks(files: &[PathBuf]) -> Vec<(String, PathBuf)> {
     files.iter().map(named).collect()
 }
 
-/// Means over people, in the order of the first row of each kind.
+/// Returns the means over people, in the order of the first row of each kind.
 fn means(rows: &[Row]) -> Vec<Row> {
     let mut kinds: Vec<(usize, &str)> = Vec::new();
     for row in rows {

@@ -1,4 +1,4 @@
-//! Small images of an avatar: with all Gaussians, and with those that pixels tell apart.
+//! Small images of an avatar: with all Gaussians, and with level of detail.
 
 use std::{
     fmt::Write as _,
@@ -12,23 +12,23 @@ use flyrig_types::{Camera, Pose, RenderedView};
 use glam::DVec3;
 use serde::Serialize;
 
-/// Sides of the images are divided by up to two to this power.
+/// Largest number of halvings of the image size.
 const MOST_HALVINGS: u32 = 4;
 
-/// Images of one size.
+/// Result for one image size.
 #[derive(Debug, Serialize)]
 pub struct SmallViews {
-    /// Height of the images, pixels, that of the first camera.
+    /// Height of the images of the first camera, pixels.
     height: u32,
-    /// Gaussians of a view: all, and those that are left.
+    /// Mean Gaussians per view without and with level of detail.
     gaussians: [f64; 2],
-    /// Milliseconds of posing and drawing a view, of both.
+    /// Milliseconds of posing and rendering a view, without and with level of detail.
     view_ms: [f64; 2],
-    /// PSNR of both against the view at its whole size, averaged over pixels, decibels.
+    /// PSNR against the averaged full-size view, without and with level of detail, decibels.
     psnr_db: [f64; 2],
 }
 
-/// Draws an avatar in some frames by cameras that see it ever smaller.
+/// Renders an avatar in some frames at ever smaller image sizes.
 pub fn small_views(
     gpu: &GpuContext,
     avatar: &Avatar,
@@ -73,7 +73,7 @@ pub fn small_views(
     Ok(rows)
 }
 
-/// The rows as a table.
+/// Formats the rows as a table.
 pub fn table(rows: &[SmallViews]) -> String {
     let mut text = String::from(
         "| image height | Gaussians | a view ms | PSNR to the large view dB | with all Gaussians: a view ms | PSNR dB |\n|---|---|---|---|---|---|\n",
@@ -88,7 +88,7 @@ pub fn table(rows: &[SmallViews]) -> String {
     text
 }
 
-/// The same camera with sides halved so often; pixel centres are at integers.
+/// Returns the camera with its image size halved `level` times; pixel centres are at integers.
 fn halved(camera: &Camera, level: u32) -> Camera {
     let mut camera = camera.clone();
     let share = 0.5f64.powi(level as i32);
@@ -100,7 +100,7 @@ fn halved(camera: &Camera, level: u32) -> Camera {
     camera
 }
 
-/// Means over squares of `side` pixels of sRGB times coverage, and of coverage, 0..=1.
+/// Averages sRGB times coverage, and coverage, over squares of `side` pixels; 0..=1.
 fn average(view: &RenderedView, side: usize) -> Vec<[f64; 4]> {
     let (width, height) = (view.width as usize, view.height as usize);
     let pixel = |x: usize, y: usize| -> [f64; 4] {
@@ -122,7 +122,7 @@ fn average(view: &RenderedView, side: usize) -> Vec<[f64; 4]> {
     means
 }
 
-/// Sum of squared differences where somebody is in one of both, and their number.
+/// Returns the sum of squared differences where either image shows a person, and their number.
 fn difference(found: &[[f64; 4]], wanted: &[[f64; 4]]) -> (f64, usize) {
     let (mut sum, mut count) = (0.0, 0);
     for (a, b) in found.iter().zip(wanted).filter(|(a, b)| a[3] > 0.0 || b[3] > 0.0) {

@@ -1,4 +1,5 @@
-//! `flyrig-bench avatar`: error of avatars against the time of their fit, and time and memory by their number of Gaussians.
+//! `flyrig-bench avatar`: error of avatars over the time of their fit, for variants of the fit; run time and memory over the number of
+//! Gaussians.
 
 mod detail;
 mod variant;
@@ -9,7 +10,7 @@ use std::{
     time::{Duration, Instant},
 };
 
-use crate::harness::{arguments::ReplayArgs, images::copy, statistics::exponent};
+use crate::harness::{arguments::RecordedArgs, images::copy, statistics::exponent};
 use anyhow::{Context, Result};
 use clap::{Args, builder::TypedValueParser as _};
 use detail::{SmallViews, small_views};
@@ -36,17 +37,17 @@ use variant::Variant;
 #[derive(Debug, Args)]
 #[command(mut_arg("out", |arg| arg.default_value("out/bench-avatar")))]
 pub struct BenchAvatarArgs {
-    /// Data set in EasyMocap layout, as `flyrig eval` and `flyrig sim export` know it.
+    /// Data set in EasyMocap layout, as `flyrig eval` reads and `flyrig sim export` writes it.
     pub dataset: PathBuf,
     #[command(flatten)]
-    pub replay: ReplayArgs,
-    /// Frames of poses that avatars are not fitted to; they are fitted to --frames, the first 30 without it.
+    pub replay: RecordedArgs,
+    /// Frames with novel poses for the evaluation; avatars are fitted to --frames, by default the first 30.
     #[arg(long, default_value = "30..60", value_parser = parse_range)]
     pub novel: Range<u64>,
-    /// Frames from one that is scored to the next.
+    /// Frames from one scored frame to the next.
     #[arg(long, default_value_t = 5, value_parser = clap::value_parser!(u32).range(1..=1000))]
     pub every: u32,
-    /// Where pose and masks come from.
+    /// Source of pose and masks.
     #[arg(long, value_enum, default_value = "given")]
     pub pose: Origin,
     /// Numbers of Gaussians, comma separated.
@@ -61,7 +62,7 @@ pub struct BenchAvatarArgs {
     /// Rows of the ablation tables (docs/benchmarks/avatar.md), comma separated.
     #[arg(long, value_enum, value_delimiter = ',', default_value = "direct")]
     pub variant: Vec<Variant>,
-    /// As in `flyrig avatar build`.
+    /// Weight of the attraction between neighbouring Gaussians, as in `flyrig avatar build`.
     #[arg(long, default_value_t = 5.0)]
     pub pull: f32,
     #[command(flatten)]
@@ -71,7 +72,7 @@ pub struct BenchAvatarArgs {
 /// Name of the person as it is rendered live, in the table of costs.
 const LIVE: &str = "live";
 
-/// Images of the held-out cameras at one instant, and the person then.
+/// Held-out images and the state of the person at one instant.
 struct Held {
     number: u64,
     pose: Pose,
@@ -79,37 +80,37 @@ struct Held {
     truths: Vec<Option<(Image, Option<Mask>)>>,
 }
 
-/// Scores after some time of fitting.
+/// Scores at one time of the fit.
 #[derive(Debug, Serialize)]
 struct Row {
     variant: String,
     gaussians: usize,
-    /// Seconds of fitting, without tracking and scoring, and steps.
+    /// Seconds of fitting, without tracking and scoring; steps.
     seconds: f64,
     steps: u64,
-    /// Frames of the fit, moved as they were tracked.
+    /// Scores in the frames of the fit, with the tracked deformation.
     view: CameraScore,
-    /// Other frames, by the pose alone.
+    /// Scores in other frames, driven by the pose alone.
     pose: CameraScore,
 }
 
-/// Cost of an avatar of some size, or of the person as it is drawn live.
+/// Run time and memory of an avatar, or of the person as it is rendered live.
 #[derive(Debug, Serialize)]
 struct Cost {
     name: String,
     gaussians: usize,
     track_secs: f64,
-    /// Milliseconds of one step of the fit.
+    /// Milliseconds per step of the fit.
     step_ms: f64,
-    /// Milliseconds of posing once, and of drawing a view and reading it back.
+    /// Milliseconds of posing, and of rendering a view and reading it back.
     pose_ms: f64,
     view_ms: f64,
     file_mb: f64,
-    /// Of the process when the fit ends.
+    /// Resident memory of the process at the end of the fit.
     resident_mib: f64,
-    /// Held-out cameras in the frames of the fit, at the end.
+    /// PSNR of the held-out cameras in the frames of the fit, at its end.
     psnr_db: f64,
-    /// The avatar in small images.
+    /// Renderings in small images.
     small: Vec<SmallViews>,
 }
 
@@ -156,7 +157,7 @@ fn write(args: &BenchAvatarArgs, rows: &[Row], costs: &[Cost]) -> Result<()> {
     write_whole(&args.output.out.join("avatar.svg"), plot(rows).svg().as_bytes())
 }
 
-/// Scores the person as it is drawn live.
+/// Scores the person as it is rendered live.
 fn live(args: &BenchAvatarArgs, settings: &ReplaySettings, gpu: &GpuContext) -> Result<Cost> {
     let mut replay = Replay::open(settings, gpu)?;
     let (mut sheet, mut spent, mut views, mut at) = (ScoreSheet::default(), Duration::ZERO, 0u32, 0u64);
@@ -193,7 +194,7 @@ fn live(args: &BenchAvatarArgs, settings: &ReplaySettings, gpu: &GpuContext) -> 
     })
 }
 
-/// Tracks the person of a take and keeps the held-out images of some frames. Returns the seconds as well.
+/// Tracks the person of a take and keeps the held-out images of some frames. Returns also the held-out cameras and the seconds.
 fn track(
     args: &BenchAvatarArgs,
     settings: &ReplaySettings,
@@ -239,7 +240,7 @@ fn score(
     Ok(())
 }
 
-/// Scores an avatar in some frames. Returns the mean times of posing and of a view, milliseconds.
+/// Scores an avatar in some frames. Returns also the mean milliseconds of posing and of a view.
 fn scored(
     (avatar, scene): (&Avatar, &mut AvatarScene),
     frames: &[Held],
@@ -269,7 +270,7 @@ fn scored(
     Ok((score, [ms(posing, frames.len()), ms(drawing, views as usize)]))
 }
 
-/// Fits an avatar and scores it after each of the wanted times.
+/// Fits an avatar and scores it at each of the requested times or steps.
 fn fit(
     args: &BenchAvatarArgs,
     gpu: &GpuContext,
@@ -387,7 +388,7 @@ fn table(rows: &[Row], costs: &[Cost]) -> String {
     text
 }
 
-/// Error over the time of fitting.
+/// Plots PSNR over the time of the fit.
 fn plot(rows: &[Row]) -> Plot {
     let mut series: Vec<Series> = Vec::new();
     for row in rows.iter().filter(|row| row.steps > 0) {

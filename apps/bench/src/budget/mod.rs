@@ -1,8 +1,8 @@
-//! `flyrig-bench budget`: what each kind of work that may be left out costs in views, and the run time that it saves.
+//! `flyrig-bench budget`: error in views and saved run time of each kind of work that a budget may skip.
 
 use std::{fmt::Write as _, time::Instant};
 
-use crate::harness::arguments::ReplayArgs;
+use crate::harness::arguments::RecordedArgs;
 use anyhow::{Context, Result};
 use clap::Args;
 use flyrig_fusion::{BudgetSettings, Effort, Origin, Outcome, PersonId, Solver};
@@ -21,14 +21,14 @@ use std::path::PathBuf;
 #[derive(Debug, Args)]
 #[command(mut_arg("out", |arg| arg.default_value("out/bench-budget")))]
 pub struct BenchBudgetArgs {
-    /// Data set in EasyMocap layout, as `flyrig eval` and `flyrig sim export` know it.
+    /// Data set in EasyMocap layout, as `flyrig eval` reads and `flyrig sim export` writes it.
     pub dataset: PathBuf,
     #[command(flatten)]
-    pub replay: ReplayArgs,
-    /// Where pose and masks come from.
+    pub replay: RecordedArgs,
+    /// Source of pose and masks.
     #[arg(long, value_enum, default_value = "estimated")]
     pub pose: Origin,
-    /// Budgets, sets a second, comma separated.
+    /// Budgets, frame sets per second, comma separated.
     #[arg(long, value_delimiter = ',', default_value = "1,2,3,4,5,6,8,10,15,30")]
     pub budgets: Vec<f64>,
     #[command(flatten)]
@@ -37,29 +37,29 @@ pub struct BenchBudgetArgs {
     pub surface: GaussiansArgs,
 }
 
-/// Sets that are neither timed nor scored: the first ones always get all the work.
+/// Frame sets that are neither timed nor scored: the first ones always get all the work.
 const WARM_UP: u64 = 12;
 
-/// One way of going through the data set.
+/// Result of one way of processing the data set.
 #[derive(Debug, Serialize)]
 struct Row {
     name: String,
-    /// Milliseconds a set with one view drawn, mean and 95th percentile.
+    /// Milliseconds per frame set with one rendered view, mean and 95th percentile.
     set_ms: f64,
     p95_ms: f64,
     score: CameraScore,
-    /// Level of effort after each timed set, under a budget.
+    /// Level of effort after each timed frame set, with a budget.
     levels: Vec<usize>,
 }
 
-/// Settings of a run.
+/// Settings of one way of processing.
 struct Way {
     name: String,
     budget: BudgetSettings,
     solver: Solver,
 }
 
-/// Runs in their order: everything, the other solvers, single kinds of work left out, levels, budgets.
+/// Returns the ways in order: all work, the other solvers, single kinds of work skipped, levels, budgets.
 fn ways(pose: Origin, budgets: &[f64]) -> Vec<Way> {
     let full = Effort::FULL;
     let way = |name: &str, budget| Way { name: name.to_owned(), budget, solver: Solver::GaussNewton };
@@ -195,7 +195,7 @@ fn table(rows: &[Row]) -> String {
     text
 }
 
-/// Run time against error: fixed configurations, levels, budgets.
+/// Plots run time against error: fixed configurations, levels, budgets.
 fn plot(rows: &[Row]) -> Plot {
     let full = rows.first().map_or(0.0, |row| row.score.psnr_db);
     let of = |name: &str, line, belongs: &dyn Fn(&str) -> bool| Series {
@@ -222,7 +222,7 @@ fn plot(rows: &[Row]) -> Plot {
     }
 }
 
-/// Level of effort over the sets, for each budget.
+/// Plots the level of effort over the frame sets, for each budget.
 fn plot_levels(rows: &[Row]) -> Plot {
     let points = |row: &Row| {
         let levels = row.levels.iter().enumerate();

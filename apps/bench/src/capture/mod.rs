@@ -1,7 +1,7 @@
-//! `flyrig-bench capture`: does capture keep its pace and its memory for as long as a take lasts?
+//! `flyrig-bench capture`: frame rate, latency, memory and processor time of capture over a long take.
 //!
-//! Plain cameras of this process at a fixed rate go through everything that real ones go through after their driver: camera
-//! threads, decoding, the queue, the synchronizer.
+//! Frames of plain cameras of this process pass through the same stages as those of real cameras: camera threads, decoding, the queue,
+//! the synchronizer.
 
 mod processor_time;
 pub mod record;
@@ -29,20 +29,20 @@ use steady::{Steady, host_clock};
 /// Arguments of the command.
 #[derive(Debug, Args)]
 pub struct BenchCaptureArgs {
-    /// How long.
+    /// Duration, minutes.
     #[arg(long, default_value_t = 30.0, value_parser = parse_minutes)]
     pub minutes: f64,
     #[command(flatten)]
     pub rig: PlainCameras,
 }
 
-/// Share of the run after which memory counts: buffers and pools have grown by then.
+/// Fraction of the run after which memory is measured: buffers and pools have grown by then.
 const WARM_UP: f64 = 0.1;
-/// Memory and the processor are looked at so often in a run.
+/// Number of memory samples in a run.
 const LOOKS: u32 = 180;
 const CELLS: u32 = 40;
 
-/// Every second camera sends JPEG.
+/// Creates the cameras; every second one sends JPEG.
 fn cameras(args: &BenchCaptureArgs) -> Result<Vec<Box<dyn CameraSource>>> {
     let clock = host_clock();
     let [width, height] = args.rig.size;
@@ -161,7 +161,7 @@ fn report(
     text
 }
 
-/// Least squares, units of y a unit of x.
+/// Returns the slope of the least-squares line through points.
 fn slope(points: &[(f64, f64)]) -> f64 {
     let n = points.len().max(1) as f64;
     let mean = |f: &dyn Fn(&(f64, f64)) -> f64| points.iter().map(f).sum::<f64>() / n;
@@ -170,7 +170,7 @@ fn slope(points: &[(f64, f64)]) -> f64 {
     if spread > 0.0 { points.iter().map(|p| (p.0 - x) * (p.1 - y)).sum::<f64>() / spread } else { 0.0 }
 }
 
-/// MiB, one number of every few.
+/// Formats a subset of the memory samples, MiB.
 fn sparkline(memory: &[(f64, f64)]) -> String {
     let step = memory.len().div_ceil(CELLS as usize).max(1);
     memory.iter().step_by(step).map(|(_, mib)| format!("{mib:.1}")).collect::<Vec<_>>().join(" ")

@@ -1,8 +1,8 @@
-//! Which thread took how much of the processor.
+//! Processor time by thread.
 
 use std::{collections::BTreeMap, fs};
 
-/// Processor time of this process' threads by name, in ticks of 10 ms, where the system tells it.
+/// Returns the processor time of this process' threads by name, in ticks of 10 ms; empty where the system does not report it.
 pub fn cpu_ticks() -> BTreeMap<String, u64> {
     let mut ticks = BTreeMap::new();
     for task in fs::read_dir("/proc/self/task").into_iter().flatten().flatten() {
@@ -17,7 +17,7 @@ pub fn cpu_ticks() -> BTreeMap<String, u64> {
     ticks
 }
 
-/// Cores by name of thread between two looks.
+/// Returns the used cores by thread name between two samples.
 pub fn cpu_share(before: &BTreeMap<String, u64>, after: &BTreeMap<String, u64>, seconds: f64) -> BTreeMap<String, f64> {
     let used = |(name, ticks): (&String, &u64)| {
         let ticks = ticks.saturating_sub(before.get(name).copied().unwrap_or(0));

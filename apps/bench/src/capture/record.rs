@@ -1,6 +1,6 @@
-//! `flyrig-bench record`: what recording uncompressed cameras costs, and what is lost.
+//! `flyrig-bench record`: bytes, processor time and loss of recordings of uncompressed cameras.
 //!
-//! Plain cameras of this process give images of a simulated person with a sensor's noise, as YUYV.
+//! Plain cameras of this process deliver images of a simulated person with sensor noise, as YUYV.
 
 use std::{
     path::Path,
@@ -29,32 +29,32 @@ pub struct BenchRecordArgs {
     /// Seconds for each quality.
     #[arg(long, default_value_t = 5.0, value_parser = parse_seconds)]
     pub seconds: f64,
-    /// JPEG qualities, comma separated; 0 records images as they come.
+    /// JPEG qualities, comma separated; 0 records images uncompressed.
     #[arg(long, value_delimiter = ',', default_values_t = [0, 80, 90, 95, 98], value_parser = clap::value_parser!(u8).range(0..=100))]
     pub qualities: Vec<u8>,
-    /// Folder for the recordings, which are removed again; the system's for temporary files otherwise.
+    /// Folder of the recordings, which are removed again; the system's folder of temporary files otherwise.
     #[arg(long)]
     pub folder: Option<PathBuf>,
     #[command(flatten)]
     pub rig: PlainCameras,
 }
 
-/// Images that a camera gives in turn.
+/// Images that a camera delivers in turn.
 const PICTURES: usize = 4;
-/// Of a sensor of a webcam's kind, electrons.
+/// Full well and read noise of the sensor of a webcam, electrons.
 const FULL_WELL: f64 = 8000.0;
 const READ_NOISE: f64 = 4.0;
 
-/// What one quality came to.
+/// Result of one quality.
 struct Row {
     quality: u8,
     recorded: Recorded,
-    /// Seconds from the first look at the processor to the last one.
+    /// Seconds between the two samples of processor time.
     seconds: f64,
-    /// Cores of one camera's compression, and of the file's thread.
+    /// Cores used by the compression of one camera, and by the thread that writes the file.
     compressing: f64,
     writing: f64,
-    /// Of the images that come back, in RGB; infinite when they are the same.
+    /// PSNR of the recorded images in RGB; infinite for identical images.
     psnr_db: f64,
 }
 
@@ -132,7 +132,7 @@ fn run(args: &BenchRecordArgs, quality: u8, path: &Path, pictures: &Arc<Vec<Vec<
     Ok(Row { quality, recorded, seconds, compressing, writing: of("recorder"), psnr_db })
 }
 
-/// Of the first images of the first camera against what it sent.
+/// Returns the PSNR of the first recorded images of the first camera against the sent ones, decibels.
 fn psnr_db(path: &Path, [width, height]: [u32; 2], pictures: &[Vec<u8>]) -> Result<f64> {
     let mut replay = McapReplay::open(&"00".into(), path)?;
     let (mut square, mut count) = (0.0, 0usize);
@@ -148,7 +148,7 @@ fn psnr_db(path: &Path, [width, height]: [u32; 2], pictures: &[Vec<u8>]) -> Resu
     Ok(10.0 * (255.0 * 255.0 * count as f64 / square).log10())
 }
 
-/// Images of a simulated person, as YUYV.
+/// Renders images of a simulated person, as YUYV.
 fn pictures([width, height]: [u32; 2], gpu: &GpuContext) -> Result<Arc<Vec<Vec<u8>>>> {
     ensure!(width % 2 == 0, "YUYV needs an even width, not {width}");
     let sensor = SensorConfig {
@@ -164,7 +164,7 @@ fn pictures([width, height]: [u32; 2], gpu: &GpuContext) -> Result<Arc<Vec<Vec<u
     Ok(Arc::new((0..PICTURES).map(picture).collect::<Result<_>>()?))
 }
 
-/// BT.601 of limited range, as cameras send it; two pixels share the mean of their colours.
+/// Converts RGB to YUYV in BT.601 with limited range, as cameras send it; two pixels share their mean chroma.
 fn yuyv(rgb: &[u8]) -> Vec<u8> {
     let byte = |value: f64| value.round().clamp(0.0, 255.0) as u8;
     let pair = |pair: &[u8]| {
@@ -194,7 +194,8 @@ mod tests {
     fn every_quality_is_measured() {
         let folder = tempfile::tempdir().unwrap();
         let (seconds, size, qualities) = (1.0, [64, 48], vec![]);
-        let args = BenchRecordArgs { seconds, cameras: 2, fps: 30.0, size, qualities, folder: None };
+        let rig = PlainCameras { cameras: 2, fps: 30.0, size };
+        let args = BenchRecordArgs { seconds, rig, qualities, folder: None };
         let pictures = Arc::new(vec![vec![90; 64 * 48 * 2], vec![160; 64 * 48 * 2]]);
         let raw = run(&args, 0, &folder.path().join("raw.mcap"), &pictures).unwrap();
         assert!(raw.psnr_db.is_infinite() && raw.recorded.frames > 0);

@@ -1,4 +1,4 @@
-//! Cameras of this process that behave like a driver's.
+//! Cameras of this process that behave like those of a driver.
 
 use std::{sync::Arc, time::Duration};
 
@@ -11,7 +11,7 @@ pub fn host_clock() -> HostClock {
     HostClock::new(flyrig_capture::monotonic_nanos)
 }
 
-/// A camera that gives a few images in turn at a fixed rate, as a driver does: late readers lose frames, by number.
+/// A camera that delivers a few images in turn at a fixed rate; like with a driver, a late reader loses frames, and their numbers skip.
 pub struct Steady {
     camera: CameraId,
     clock: HostClock,
@@ -26,7 +26,7 @@ pub struct Steady {
 }
 
 impl Steady {
-    /// Begins in a fifth of a second. Every image has the bytes of its size and format.
+    /// Creates a camera that starts in 0.2 s. Every image must have the bytes of its size and format.
     pub fn new(
         camera: CameraId,
         clock: &HostClock,

@@ -1,7 +1,7 @@
-//! One way of tracking, and what it gave.
+//! A variant of the tracking, and its result.
 
 use crate::harness::{
-    sequence::{Motion, Sequence, SequenceConfig},
+    sequence::{SequenceConfig, SequenceMotion, SimulatedSequence},
     surface::Points,
 };
 use anyhow::{Context, Result};
@@ -14,61 +14,61 @@ use flyrig_metrics::{ScoreSheet, score_view};
 use flyrig_tracker::FIRST_FRAMES;
 use serde::Serialize;
 
-/// Points on the tracked surface.
+/// Number of points on the tracked surface.
 const OUR_POINTS: usize = 20_000;
 
-/// What to run.
+/// A variant of the tracking on one sequence.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Case {
-    /// What is special about it: a solver's name, or that and what differs from its defaults.
+    /// Name of the solver, followed by the difference from its defaults if there is one.
     pub variant: String,
     pub solver: Solver,
-    /// None: skinned only.
+    /// Options of the deformation; `None` for skinning alone.
     pub options: Option<DeformOptions>,
-    /// Gaussians that are drawn.
+    /// Number of rendered Gaussians.
     pub gaussians: usize,
-    /// Input cameras.
+    /// Number of input cameras.
     pub views: usize,
     pub sequence: SequenceConfig,
 }
 
-/// What came out.
+/// Result of a case.
 #[derive(Debug, Clone, Serialize)]
-pub struct Row {
+pub struct CaseRow {
     pub name: String,
     pub variant: String,
     pub solver: Solver,
     pub gaussians: usize,
-    /// Gaussians that were compared with the images.
+    /// Number of Gaussians that were compared with the images.
     pub compared: usize,
     pub views: usize,
     pub sequence: SequenceConfig,
-    /// Over the second half of the sequence.
+    /// Scores over the second half of the sequence.
     pub psnr_db: f64,
     pub ssim: f64,
     pub iou: f64,
-    /// Mean distance of our surface to the true one, of the true one to ours, and of what the cameras see of it, at the last
-    /// instant; the mean of the first two is the Chamfer distance.
+    /// Mean distances at the last instant: of the tracked surface to the true one, of the true one to the tracked one, and of its part
+    /// that the cameras see. The Chamfer distance is the mean of the first two.
     pub accuracy_mm: f64,
     pub completeness_mm: f64,
     pub seen_mm: f64,
     pub chamfer_mm: f64,
-    /// Mean milliseconds a frame of every stage.
+    /// Mean milliseconds per frame of every stage.
     pub stages_ms: Vec<(String, f64)>,
-    /// Mean milliseconds of the deformation, over all frames, the first ten, and those after them: the processor's where the
-    /// graphics adapter is software, so that other programs do not count.
+    /// Mean milliseconds of the deformation over all frames, the first ten, and the others; processor time where the graphics adapter
+    /// is software, so that other programs do not count.
     pub deformation_ms: f64,
     pub first_ms: f64,
     pub later_ms: f64,
-    /// What was left out, counted over all frames.
+    /// Counters of skipped work over all frames.
     pub skipped: Vec<(String, u64)>,
-    /// Total loss of the first frame's iterations, and of the last frame's.
+    /// Total loss by iteration, of the first and of the last frame.
     pub first_energy: Vec<f64>,
     pub last_energy: Vec<f64>,
 }
 
 impl Case {
-    /// A solver as it is by default.
+    /// Creates a case of a solver with its defaults.
     pub fn new(solver: Solver, gaussians: usize, views: usize, sequence: SequenceConfig) -> Self {
         let variant = match solver {
             Solver::None => "off",
@@ -78,7 +78,7 @@ impl Case {
         Self { variant: variant.to_owned(), solver, options: solver.options(), gaussians, views, sequence }
     }
 
-    /// The same but for one thing.
+    /// Returns the case with one change of its options, which is named in its variant.
     pub fn but(&self, what: &str, change: impl FnOnce(&mut DeformOptions)) -> Self {
         let mut case = self.clone();
         case.variant = format!("{}, {what}", case.variant);
@@ -88,16 +88,16 @@ impl Case {
         case
     }
 
-    /// For tables.
+    /// Returns the name for tables.
     pub fn name(&self) -> String {
         let SequenceConfig { seed, side, motion, .. } = self.sequence;
-        let still = if motion == Motion::Still { ", still" } else { "" };
+        let still = if motion == SequenceMotion::Still { ", still" } else { "" };
         format!("{}; {} views, {side}², seed {seed}{still}", self.variant, self.views)
     }
 }
 
 /// Builds a session for a case.
-pub fn session(gpu: &GpuContext, sequence: &Sequence, case: &Case) -> Result<Session> {
+pub fn session(gpu: &GpuContext, sequence: &SimulatedSequence, case: &Case) -> Result<Session> {
     let rig = sequence.inputs(case.views);
     let perception = GivenPerception::repeating(&rig, sequence.template.clone(), sequence.track.clone());
     let settings = SessionSettings {
@@ -109,31 +109,31 @@ pub fn session(gpu: &GpuContext, sequence: &Sequence, case: &Case) -> Result<Ses
     Ok(builder.perception(perception).build()?)
 }
 
-/// Points on the surface of the last update.
+/// Spreads points over the surface of the last update.
 fn tracked_surface(session: &Session) -> Result<Points> {
     let subject = session.subject(PersonId::default()).context("there is nobody")?;
     let (positions, _) = subject.surface(subject.pose().context("no frame was used")?);
     Ok(Points::on(&positions, &subject.template().triangles, OUR_POINTS))
 }
 
-/// Mean distance of our surface to the true one at the last instant, and of the true one to ours, millimetres.
-fn distances_mm(ours: &Points, sequence: &Sequence) -> [f64; 2] {
+/// Returns the mean distances of the tracked surface to the true one at the last instant and vice versa, millimetres.
+fn distances_mm(ours: &Points, sequence: &SimulatedSequence) -> [f64; 2] {
     let to_truth = sequence.truth.mean_distance(&ours.points);
     [to_truth, ours.mean_distance(&sequence.truth.points)].map(|metres| metres * 1e3)
 }
 
-/// Chamfer distance of the last update's surface, to the truth of the last instant.
-pub fn chamfer_mm(session: &Session, sequence: &Sequence) -> Result<f64> {
+/// Returns the Chamfer distance of the last update's surface to the truth of the last instant, millimetres.
+pub fn chamfer_mm(session: &Session, sequence: &SimulatedSequence) -> Result<f64> {
     Ok(0.5 * distances_mm(&tracked_surface(session)?, sequence).iter().sum::<f64>())
 }
 
-/// Tracks the whole sequence.
-pub fn run_case(gpu: &GpuContext, sequence: &Sequence, case: &Case) -> Result<Row> {
+/// Tracks a sequence in a new session.
+pub fn run_case(gpu: &GpuContext, sequence: &SimulatedSequence, case: &Case) -> Result<CaseRow> {
     run_session(session(gpu, sequence, case)?, sequence, case)
 }
 
-/// Tracks the whole sequence with this session.
-pub fn run_session(mut session: Session, sequence: &Sequence, case: &Case) -> Result<Row> {
+/// Tracks a sequence in an existing session.
+pub fn run_session(mut session: Session, sequence: &SimulatedSequence, case: &Case) -> Result<CaseRow> {
     let person = PersonId::default();
     let mut sheet = ScoreSheet::default();
     let (mut first_energy, mut last_energy) = (Vec::new(), Vec::new());
@@ -165,7 +165,7 @@ pub fn run_session(mut session: Session, sequence: &Sequence, case: &Case) -> Re
         session.stages.summary().into_iter().map(|s| (s.name.trim().to_owned(), f64::from(s.mean_ms))).collect();
     let mean_ms = |times: &[f64]| times.iter().sum::<f64>() / times.len().max(1) as f64;
     let (first, later) = times_ms.split_at(times_ms.len().min(FIRST_FRAMES as usize));
-    Ok(Row {
+    Ok(CaseRow {
         name: case.name(),
         variant: case.variant.clone(),
         solver: case.solver,

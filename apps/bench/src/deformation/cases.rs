@@ -1,16 +1,16 @@
 //! Names of the variants that the tables compare, and the sizes that belong to them.
 
-/// Input cameras of a case that does not vary them.
+/// Number of input cameras where it is not varied.
 pub const VIEWS: usize = 3;
-/// Every Gaussian is compared with the images.
+/// Variant that compares every Gaussian with the images.
 pub const ALL_GAUSSIANS: &str = "all Gaussians";
-/// Images are not halved.
+/// Variant that compares images at full size.
 pub const FULL_SIZE: &str = "full size";
-/// No level of detail.
+/// Variant without level of detail.
 pub const ALL_DETAIL: &str = "all detail";
-/// Every input view is compared.
+/// Variant that compares every input view.
 pub const ALL_VIEWS: &str = "all views";
-/// Iterations go on after the error has settled.
+/// Variant that iterates after convergence.
 pub const NO_REST: &str = "no rest";
 
 /// Returns the side of images in which a pixel covers several of the compared Gaussians, pixels.

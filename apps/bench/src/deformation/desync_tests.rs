@@ -1,27 +1,27 @@
-//! Cameras that do not expose together.
+//! Cameras without a common exposure.
 
-use super::case::{Case, Row, run_session, session};
-use crate::harness::sequence::{Motion, Sequence, SequenceConfig};
+use super::case::{Case, CaseRow, run_session, session};
+use crate::harness::sequence::{SequenceConfig, SequenceMotion, SimulatedSequence};
 use flyrig_fusion::Solver;
 use flyrig_gpu::{AdapterChoice, GpuContext};
 
 const SIDE: u32 = 160;
 
-/// Scores of the second half of a fast turn.
-fn scores(gpu: &GpuContext, sequence: &Sequence, per_view_time: bool, solver: Solver) -> Row {
+/// Returns the scores of the second half of a fast turn.
+fn scores(gpu: &GpuContext, sequence: &SimulatedSequence, per_view_time: bool, solver: Solver) -> CaseRow {
     let case = Case::new(solver, 9_000, 3, sequence.config());
     let mut session = session(gpu, sequence, &case).unwrap();
     session.set_per_view_time(per_view_time);
     run_session(session, sequence, &case).unwrap()
 }
 
-/// A full turn in two seconds; each camera exposes somewhere within the frame's period after the instant.
+/// Tests a full turn in two seconds; each camera exposes at some time within the frame period after the instant.
 #[test]
 fn a_rig_without_genlock_loses_little_with_the_time_of_each_view() {
     let gpu = GpuContext::new(&AdapterChoice::Best).unwrap();
-    let config = SequenceConfig { motion: Motion::Turn, seed: 1, side: SIDE, frames: 10, fps: 30.0 };
-    let genlocked = Sequence::simulate(&gpu, config).unwrap();
-    let shifted = Sequence::simulate_shifted(&gpu, config, &[4_100_000, 29_300_000, 17_600_000]).unwrap();
+    let config = SequenceConfig { motion: SequenceMotion::Turn, seed: 1, side: SIDE, frames: 10, fps: 30.0 };
+    let genlocked = SimulatedSequence::simulate(&gpu, config).unwrap();
+    let shifted = SimulatedSequence::simulate_shifted(&gpu, config, &[4_100_000, 29_300_000, 17_600_000]).unwrap();
     for solver in [Solver::None, Solver::GaussNewton] {
         let together = scores(&gpu, &genlocked, true, solver);
         let on = scores(&gpu, &shifted, true, solver);

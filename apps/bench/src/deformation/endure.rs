@@ -1,4 +1,4 @@
-//! `flyrig-bench endure`: a person who turns to and fro for thousands of frames; error and memory must stay as they were.
+//! `flyrig-bench endure`: stability of error and memory over thousands of frames of a person who turns back and forth.
 
 use std::{fmt::Write as _, ops::Range};
 
@@ -6,7 +6,7 @@ use super::case::{Case, chamfer_mm, session};
 use super::cases::VIEWS;
 use crate::harness::{
     arguments::SimulationArgs,
-    sequence::{Motion, Sequence, SequenceConfig},
+    sequence::{SequenceConfig, SequenceMotion, SimulatedSequence},
 };
 use anyhow::{Context, Result};
 use clap::Args;
@@ -25,7 +25,7 @@ use serde::Serialize;
 #[derive(Debug, Args)]
 #[command(mut_arg("out", |arg| arg.default_value("out/bench-endure")), mut_arg("side", |arg| arg.default_value("160")), mut_arg("gaussians", |arg| arg.default_value("12000")))]
 pub struct BenchEndureArgs {
-    /// Frames in all.
+    /// Total number of frames.
     #[arg(long, default_value_t = 10_000, value_parser = clap::value_parser!(u64).range(300..=10_000_000))]
     pub frames: u64,
     #[command(flatten)]
@@ -36,12 +36,12 @@ pub struct BenchEndureArgs {
     pub surface: GaussiansArgs,
 }
 
-/// Instants from one end of the movement to the other.
+/// Instants from one end of the motion to the other.
 const INSTANTS: usize = 26;
-/// Frames that count as the beginning, and as many at the end.
+/// Frames of the beginning; the end has as many.
 const BEGINNING: Range<u64> = 100..200;
 
-/// At the far end of the movement, always in the same pose.
+/// Measurement at the far end of the motion, always in the same pose.
 #[derive(Debug, Clone, Copy, Serialize)]
 struct Point {
     frame: u64,
@@ -56,13 +56,13 @@ struct Point {
 pub fn endure(args: &BenchEndureArgs, gpu: &GpuContext) -> Result<()> {
     args.output.create()?;
     let config = SequenceConfig {
-        motion: Motion::Turn,
+        motion: SequenceMotion::Turn,
         seed: args.simulation.seed,
         side: args.simulation.side,
         frames: INSTANTS,
         fps: 30.0,
     };
-    let sequence = Sequence::simulate(gpu, config)?;
+    let sequence = SimulatedSequence::simulate(gpu, config)?;
     let bar = progress_bar(args.frames, "bench endure");
     let points = run(args, gpu, &sequence, |frame, points| {
         bar.set_position(frame);
@@ -90,11 +90,11 @@ pub fn endure(args: &BenchEndureArgs, gpu: &GpuContext) -> Result<()> {
     Ok(())
 }
 
-/// Tracks to and fro, and measures whenever the far end is reached.
+/// Tracks the motion back and forth, and measures at every arrival at the far end.
 fn run(
     args: &BenchEndureArgs,
     gpu: &GpuContext,
-    sequence: &Sequence,
+    sequence: &SimulatedSequence,
     mut progress: impl FnMut(u64, &[Point]),
 ) -> Result<Vec<Point>> {
     let case = Case::new(Solver::GaussNewton, args.surface.gaussians, VIEWS, sequence.config());
@@ -138,7 +138,7 @@ fn run(
     Ok(points)
 }
 
-/// Instant of a frame of the movement there and back.
+/// Returns the instant of a frame of the motion there and back.
 fn turned(frame: usize, last: usize) -> usize {
     if frame <= last { frame } else { 2 * last - frame }
 }
@@ -155,7 +155,7 @@ fn plot(points: &[Point], title: &str, of: fn(&Point) -> f64) -> Plot {
     }
 }
 
-/// The beginning beside as many frames at the end.
+/// Formats the means of the beginning and of the end.
 fn summary(points: &[Point]) -> String {
     let frames = points.last().map_or(0, |point| point.frame + 1);
     let end = frames.saturating_sub(BEGINNING.end - BEGINNING.start)..frames;
@@ -197,8 +197,8 @@ mod tests {
     fn to_and_fro_is_measured_at_the_far_end_and_poisons_nothing() {
         assert_eq!((0..9).map(|i| turned(i % 6, 3)).collect::<Vec<_>>(), [0, 1, 2, 3, 2, 1, 0, 1, 2]);
         let gpu = GpuContext::new(&AdapterChoice::default()).unwrap();
-        let config = SequenceConfig { motion: Motion::Turn, seed: 1, side: 64, frames: 3, fps: 30.0 };
-        let sequence = Sequence::simulate(&gpu, config).unwrap();
+        let config = SequenceConfig { motion: SequenceMotion::Turn, seed: 1, side: 64, frames: 3, fps: 30.0 };
+        let sequence = SimulatedSequence::simulate(&gpu, config).unwrap();
         let args = BenchEndureArgs {
             frames: 15,
             output: OutputArgs { out: "out".into() },

@@ -1,9 +1,9 @@
-//! Everything that happens to a rig at night: the tracking degrades, and comes back by itself.
+//! Recovery of the tracking after all kinds of faults.
 
 use std::sync::Arc;
 
 use super::case::{Case, session};
-use crate::harness::sequence::{Motion, Sequence, SequenceConfig};
+use crate::harness::sequence::{SequenceConfig, SequenceMotion, SimulatedSequence};
 use flyrig_fusion::{Outcome, PersonId, Session, Solver, Subject, TrackState, TrackWatch};
 use flyrig_gpu::{AdapterChoice, GpuContext};
 use flyrig_types::{Frame, FrameSet, Image, Mask, PixelFormat};
@@ -17,12 +17,12 @@ struct Stage {
 }
 
 impl Stage {
-    fn new(gpu: &GpuContext, sequence: &Sequence) -> Self {
+    fn new(gpu: &GpuContext, sequence: &SimulatedSequence) -> Self {
         let case = Case::new(Solver::GaussNewton, 3_000, 3, sequence.config());
         Self { sets: sequence.sets(3).collect(), session: session(gpu, sequence, &case).unwrap() }
     }
 
-    /// Plays sets, each changed by `change`; `later` nanoseconds are added to all times.
+    /// Processes frame sets, each changed by `change`; `later` nanoseconds are added to all times.
     fn play(&mut self, range: std::ops::Range<usize>, later: i64, change: impl Fn(usize, &Frame) -> Option<Frame>) {
         for set in &self.sets[range] {
             let frames = set
@@ -76,8 +76,8 @@ fn filled(value: u8) -> Mask {
 #[test]
 fn the_tracking_degrades_and_comes_back_by_itself() {
     let gpu = GpuContext::new(&AdapterChoice::Best).unwrap();
-    let config = SequenceConfig { motion: Motion::Turn, seed: 2, side: SIDE, frames: 34, fps: 30.0 };
-    let sequence = Sequence::simulate(&gpu, config).unwrap();
+    let config = SequenceConfig { motion: SequenceMotion::Turn, seed: 2, side: SIDE, frames: 34, fps: 30.0 };
+    let sequence = SimulatedSequence::simulate(&gpu, config).unwrap();
     let mut calm = Stage::new(&gpu, &sequence);
     calm.play(0..34, 0, as_is);
     let goal = calm.quality();

@@ -1,17 +1,17 @@
-//! What a benchmark's rows say together: tables, growth, what skipping saves and costs.
+//! Summary of the rows of `flyrig-bench track`: tables, growth of the run time, savings and costs of skipped work.
 
-use super::case::Row;
+use super::case::CaseRow;
 use super::cases::{ALL_DETAIL, ALL_GAUSSIANS, ALL_VIEWS, FULL_SIZE, NO_REST, VIEWS, small};
-use crate::harness::{sequence::Motion, statistics::exponent};
+use crate::harness::{sequence::SequenceMotion, statistics::exponent};
 use std::fmt::Write as _;
 
-/// Everything, for the terminal.
-pub fn summary(rows: &[Row]) -> String {
+/// Formats the summary for the terminal.
+pub fn summary(rows: &[CaseRow]) -> String {
     let parts = [table(rows), skips(rows), growth(rows), people(rows)];
     parts.into_iter().filter(|part| !part.is_empty()).collect::<Vec<_>>().join("\n")
 }
 
-fn table(rows: &[Row]) -> String {
+fn table(rows: &[CaseRow]) -> String {
     let mut text = format!(
         "{:<52} {:>7} {:>6} {:>6} {:>10} {:>7} {:>9} {:>9}\n",
         "case", "PSNR dB", "SSIM", "IoU", "chamfer mm", "seen mm", "first ms", "later ms"
@@ -29,8 +29,14 @@ fn table(rows: &[Row]) -> String {
     text
 }
 
-/// The row of this variant, person of the first row.
-fn find<'a>(rows: &'a [Row], variant: &str, views: usize, side: u32, motion: Motion) -> Option<&'a Row> {
+/// Finds the row of a variant for the person of the first row.
+fn find<'a>(
+    rows: &'a [CaseRow],
+    variant: &str,
+    views: usize,
+    side: u32,
+    motion: SequenceMotion,
+) -> Option<&'a CaseRow> {
     let seed = rows.first()?.sequence.seed;
     rows.iter().find(|r| {
         let s = r.sequence;
@@ -38,19 +44,19 @@ fn find<'a>(rows: &'a [Row], variant: &str, views: usize, side: u32, motion: Mot
     })
 }
 
-/// What each way of leaving things out saves, and what it costs in error.
-fn skips(rows: &[Row]) -> String {
+/// Formats the saved time and the cost in error of each kind of skipped work.
+fn skips(rows: &[CaseRow]) -> String {
     let Some(side) = rows.first().map(|r| r.sequence.side) else { return String::new() };
     let but = |what: &str| format!("default, {what}");
     let low = small(side);
     let pairs = [
-        ("Gaussians: fewer are compared", "default", but(ALL_GAUSSIANS), VIEWS, side, Motion::Turn),
-        ("Gaussians: two a pixel (small images)", "default", but(ALL_DETAIL), VIEWS, low, Motion::Turn),
-        ("pixels: images are halved", "default", but(FULL_SIZE), VIEWS, side, Motion::Turn),
-        ("iterations: none at rest (person stands)", "default", but(NO_REST), VIEWS, side, Motion::Still),
-        ("views: 4 of 6", "default, 4 compared", but(ALL_VIEWS), 6, side, Motion::Turn),
-        ("views: 3 of 6", "default, 3 compared", but(ALL_VIEWS), 6, side, Motion::Turn),
-        ("views: 2 of 6", "default, 2 compared", but(ALL_VIEWS), 6, side, Motion::Turn),
+        ("Gaussians: fewer are compared", "default", but(ALL_GAUSSIANS), VIEWS, side, SequenceMotion::Turn),
+        ("Gaussians: two a pixel (small images)", "default", but(ALL_DETAIL), VIEWS, low, SequenceMotion::Turn),
+        ("pixels: images are halved", "default", but(FULL_SIZE), VIEWS, side, SequenceMotion::Turn),
+        ("iterations: none at rest (person stands)", "default", but(NO_REST), VIEWS, side, SequenceMotion::Still),
+        ("views: 4 of 6", "default, 4 compared", but(ALL_VIEWS), 6, side, SequenceMotion::Turn),
+        ("views: 3 of 6", "default, 3 compared", but(ALL_VIEWS), 6, side, SequenceMotion::Turn),
+        ("views: 2 of 6", "default, 2 compared", but(ALL_VIEWS), 6, side, SequenceMotion::Turn),
     ];
     let mut text = String::new();
     for (name, with, without, views, side, motion) in pairs {
@@ -76,14 +82,14 @@ fn skips(rows: &[Row]) -> String {
     text
 }
 
-/// How the time grows.
-fn growth(rows: &[Row]) -> String {
+/// Formats the exponents of the growth of the run time.
+fn growth(rows: &[CaseRow]) -> String {
     let Some(first) = rows.first() else { return String::new() };
     let side = first.sequence.side;
     let full = |what: &str| {
         if what.is_empty() { format!("default, {FULL_SIZE}") } else { format!("default, {FULL_SIZE}, {what}") }
     };
-    let of = |variant: &str, views, side| find(rows, variant, views, side, Motion::Turn);
+    let of = |variant: &str, views, side| find(rows, variant, views, side, SequenceMotion::Turn);
     let gaussians: Vec<(f64, f64)> = ["8000 Gaussians", "", ALL_GAUSSIANS]
         .iter()
         .filter_map(|what| of(&full(what), VIEWS, side))
@@ -109,20 +115,20 @@ fn growth(rows: &[Row]) -> String {
     text
 }
 
-/// Means over the people, skinned only and tracked.
-fn people(rows: &[Row]) -> String {
+/// Formats the means over people, of skinning alone and of tracking.
+fn people(rows: &[CaseRow]) -> String {
     let Some(first) = rows.first() else { return String::new() };
-    let usual = |r: &&Row| {
+    let usual = |r: &&CaseRow| {
         let s = r.sequence;
-        r.views == VIEWS && s.side == first.sequence.side && s.motion == Motion::Turn
+        r.views == VIEWS && s.side == first.sequence.side && s.motion == SequenceMotion::Turn
     };
     let mut text = String::new();
     for variant in ["off", "default"] {
-        let of: Vec<&Row> = rows.iter().filter(usual).filter(|r| r.variant == variant).collect();
+        let of: Vec<&CaseRow> = rows.iter().filter(usual).filter(|r| r.variant == variant).collect();
         if of.len() < 2 {
             continue;
         }
-        let mean = |value: &dyn Fn(&Row) -> f64| of.iter().map(|r| value(r)).sum::<f64>() / of.len() as f64;
+        let mean = |value: &dyn Fn(&CaseRow) -> f64| of.iter().map(|r| value(r)).sum::<f64>() / of.len() as f64;
         let _ = writeln!(
             text,
             "mean of {} people, {variant}: {:.2} dB, SSIM {:.4}, IoU {:.4}, chamfer {:.2} mm, {:.2} mm of what is seen",

@@ -6,7 +6,7 @@ use super::summary;
 use super::write;
 use crate::harness::{
     arguments::SimulationArgs,
-    sequence::{Motion, Sequence, SequenceConfig},
+    sequence::{SequenceConfig, SequenceMotion, SimulatedSequence},
 };
 use anyhow::{Result, ensure};
 use clap::{Args, builder::TypedValueParser as _};
@@ -23,10 +23,10 @@ pub struct BenchTrackArgs {
     /// Frames of the sequence.
     #[arg(long, default_value_t = 14, value_parser = clap::value_parser!(u16).range(2..=1000).map(usize::from))]
     pub frames: usize,
-    /// Only the three solvers.
+    /// Run the three solvers alone.
     #[arg(long)]
     pub quick: bool,
-    /// Only the cases whose name has this text in it, "2 views" for example.
+    /// Run only cases whose names contain this text, such as "2 views".
     #[arg(long)]
     pub only: Option<String>,
     #[command(flatten)]
@@ -48,12 +48,12 @@ pub fn track(args: &BenchTrackArgs, gpu: &GpuContext) -> Result<()> {
     }
     let bar = progress_bar(cases.len() as u64, "bench track");
     let mut rows = Vec::new();
-    let mut sequence: Option<Sequence> = None;
+    let mut sequence: Option<SimulatedSequence> = None;
     for case in cases {
         bar.set_message(case.name());
         let scene = match sequence.take().filter(|known| known.config() == case.sequence) {
             Some(known) => known,
-            None => Sequence::simulate(gpu, case.sequence)?,
+            None => SimulatedSequence::simulate(gpu, case.sequence)?,
         };
         rows.push(run_case(gpu, &scene, &case)?);
         // After every case, so that a run that is stopped leaves what it has.
@@ -70,11 +70,11 @@ pub fn track(args: &BenchTrackArgs, gpu: &GpuContext) -> Result<()> {
     Ok(())
 }
 
-/// What is compared: solvers, iterations, Gaussians, resolution, views, what is skipped, people; ordered so that a sequence
-/// is simulated once.
+/// Returns all cases (solvers, iterations, Gaussians, resolutions, views, skipped work, people), those of one sequence in succession so
+/// that it is simulated once.
 fn grid(args: &BenchTrackArgs) -> Vec<Case> {
     let turn = SequenceConfig {
-        motion: Motion::Turn,
+        motion: SequenceMotion::Turn,
         seed: args.simulation.seed,
         side: args.simulation.side,
         frames: args.frames,
@@ -127,7 +127,7 @@ fn grid(args: &BenchTrackArgs) -> Vec<Case> {
         }
         cases.push(usual);
     }
-    let still = case(Solver::GaussNewton, VIEWS, SequenceConfig { motion: Motion::Still, ..turn });
+    let still = case(Solver::GaussNewton, VIEWS, SequenceConfig { motion: SequenceMotion::Still, ..turn });
     cases.push(still.but(NO_REST, |options| options.solver.rest = 0.0));
     cases.push(still.but("no rest, colour weight 2", |options| {
         (options.solver.rest, options.color_weight) = (0.0, PAPER_COLOR_WEIGHT);

@@ -1,8 +1,8 @@
-//! CSV, JSON, tables and images of a benchmark.
+//! Output files of `flyrig-bench track`: CSV, JSON, tables and plots.
 
 use std::{fmt::Write as _, path::Path};
 
-use super::{case::Row, cases::ALL_VIEWS, summary::summary};
+use super::{case::CaseRow, cases::ALL_VIEWS, summary::summary};
 use anyhow::Result;
 use flyrig_fusion::Solver;
 use flyrig_report::{
@@ -15,11 +15,11 @@ use serde::Serialize;
 struct Document<'a> {
     adapter: &'a str,
     command: String,
-    rows: &'a [Row],
+    rows: &'a [CaseRow],
 }
 
-/// Writes everything into a folder.
-pub fn all(out: &Path, adapter: &str, rows: &[Row]) -> Result<()> {
+/// Writes all files into a folder.
+pub fn all(out: &Path, adapter: &str, rows: &[CaseRow]) -> Result<()> {
     // Without the program's own place.
     let command =
         std::iter::once("flyrig-bench".to_owned()).chain(std::env::args().skip(1)).collect::<Vec<_>>().join(" ");
@@ -31,7 +31,7 @@ pub fn all(out: &Path, adapter: &str, rows: &[Row]) -> Result<()> {
     write_whole(&out.join("views.svg"), views(rows).svg().as_bytes())
 }
 
-fn csv(rows: &[Row]) -> String {
+fn csv(rows: &[CaseRow]) -> String {
     let mut text = "case,views,side,frames,psnr_db,ssim,iou,chamfer_mm,accuracy_mm,completeness_mm,seen_mm,\
                     deformation_ms,first_ms,later_ms,prepare_ms,draw_ms,derivatives_ms,solve_ms\n"
         .to_owned();
@@ -63,9 +63,9 @@ fn csv(rows: &[Row]) -> String {
     text
 }
 
-/// Error over time, of the cases that deform the first person before the usual views at the usual size.
-fn pareto(rows: &[Row]) -> Plot {
-    let same = |r: &&Row| {
+/// Plots error over run time, for the first person with the default views and size.
+fn pareto(rows: &[CaseRow]) -> Plot {
+    let same = |r: &&CaseRow| {
         rows.first().is_some_and(|first| (r.sequence, r.views) == (first.sequence, first.views))
             && r.solver != Solver::None
     };
@@ -89,9 +89,9 @@ fn pareto(rows: &[Row]) -> Plot {
     }
 }
 
-/// Energy of the first frame over iterations, each as a share of where it began: the solvers weigh differently.
-fn energy(rows: &[Row]) -> Plot {
-    let line = |r: &Row| Series {
+/// Plots the energy of the first frame over iterations, relative to its start: the solvers weigh their terms differently.
+fn energy(rows: &[CaseRow]) -> Plot {
+    let line = |r: &CaseRow| Series {
         name: r.variant.clone(),
         points: (0u32..)
             .zip(&r.first_energy)
@@ -99,7 +99,7 @@ fn energy(rows: &[Row]) -> Plot {
             .collect(),
         line: Line::Through,
     };
-    let mut chosen: Vec<&Row> =
+    let mut chosen: Vec<&CaseRow> =
         rows.iter().filter(|r| r.solver == Solver::Paper || r.variant.contains("10/4 iterations")).collect();
     if chosen.len() < 2 {
         chosen = rows.iter().filter(|r| r.solver != Solver::None).collect();
@@ -115,10 +115,11 @@ fn energy(rows: &[Row]) -> Plot {
     }
 }
 
-/// Error over the number of views.
-fn views(rows: &[Row]) -> Plot {
+/// Plots error over the number of views.
+fn views(rows: &[CaseRow]) -> Plot {
     let line = |name: &str, variant: &str| {
-        let same = |r: &&Row| rows.first().is_some_and(|first| r.sequence == first.sequence) && r.variant == variant;
+        let same =
+            |r: &&CaseRow| rows.first().is_some_and(|first| r.sequence == first.sequence) && r.variant == variant;
         let mut points: Vec<_> =
             rows.iter().filter(same).map(|r| (r.views as f64, r.chamfer_mm, format!("{:.1} dB", r.psnr_db))).collect();
         points.sort_by(|a, b| a.0.total_cmp(&b.0));

@@ -11,21 +11,21 @@ use flyrig_report::{
 
 /// Frames and cameras of recorded data sets.
 #[derive(Debug, Args)]
-pub struct ReplayArgs {
+pub struct RecordedArgs {
     /// Input cameras, comma separated.
     #[arg(long, value_delimiter = ',', default_value = "00,03,05")]
     pub inputs: Vec<String>,
-    /// Cameras that the views are compared with, comma separated.
+    /// Cameras to render and compare, comma separated.
     #[arg(long, value_delimiter = ',', default_value = "01,02,04,06")]
     pub holdout: Vec<String>,
-    /// Frames FIRST..END, END excluded; all of them otherwise.
+    /// Frames FIRST..END, END excluded; all frames otherwise.
     #[arg(long, value_parser = parse_range)]
     pub frames: Option<Range<u64>>,
     #[command(flatten)]
     pub rate: FpsArgs,
 }
 
-impl ReplayArgs {
+impl RecordedArgs {
     /// Returns settings for one data set, with poses and masks from `origin`.
     pub fn settings(&self, dataset: &Path, origin: Origin, gaussians: usize, budget: BudgetSettings) -> ReplaySettings {
         let perception = PerceptionSettings { pose: origin, masks: origin, ..PerceptionSettings::default() };

@@ -1,4 +1,4 @@
-//! A simulated sequence held in memory: what every case is given, and the truth.
+//! A simulated sequence in memory: inputs of every case, and ground truth.
 
 use std::sync::Arc;
 
@@ -11,63 +11,63 @@ use flyrig_types::{Camera, Frame, FrameSet, Image, PoseTrack, Rig};
 use glam::DVec3;
 use serde::Serialize;
 
-/// Points on the true surface that completeness is measured at.
+/// Number of points on the true surface at which completeness is measured.
 const TRUE_POINTS: usize = 20_000;
-/// A point is seen where the simulator's depth is not nearer than it by more, metres.
+/// Largest depth difference to the simulator's depth image of a visible point, metres.
 const DEPTH_TOLERANCE_M: f64 = 0.01;
 
-/// What the person does.
+/// SequenceMotion of the simulated person.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize)]
 #[serde(rename_all = "lowercase")]
-pub enum Motion {
-    /// Turns around.
+pub enum SequenceMotion {
+    /// A turn around the vertical axis.
     Turn,
-    /// Stands.
+    /// No motion.
     Still,
 }
 
-/// What is simulated.
+/// Parameters of a simulated sequence.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize)]
 pub struct SequenceConfig {
-    pub motion: Motion,
-    /// Of the person.
+    pub motion: SequenceMotion,
+    /// Seed of the person.
     pub seed: u64,
-    /// Pixels of an image's side.
+    /// Width and height of the images, pixels.
     pub side: u32,
-    /// Instants.
+    /// Number of instants.
     pub frames: usize,
-    /// Instants a second.
+    /// Instants per second.
     pub fps: f64,
 }
 
-/// Input cameras by their number, and the ones that are held out.
+/// Slots of the input cameras in order of use, and of the held-out cameras.
 const INPUTS: [usize; 6] = [0, 5, 8, 3, 10, 6];
 const HELD_OUT: [usize; 3] = [2, 7, 11];
 
 /// Frames of all cameras, and the surface at the last instant.
-pub struct Sequence {
+pub struct SimulatedSequence {
     config: SequenceConfig,
     rig: Rig,
     pub template: Template,
     pub track: PoseTrack,
-    /// By instant, then by camera; of the cameras that are used.
+    /// Frames by instant and camera slot; `None` for unused cameras.
     frames: Vec<Vec<Option<Arc<Frame>>>>,
-    /// World points of the clothed surface at the last instant.
+    /// Points on the clothed surface at the last instant, world coordinates.
     pub truth: Points,
     /// Depth images of the input cameras at the last instant.
     depths: Vec<(Camera, Vec<f32>)>,
-    /// The room without people, by camera.
+    /// Images of the empty room, by camera slot.
     plates: Vec<Image>,
 }
 
-impl Sequence {
-    /// Draws everything. All cameras expose at once.
+impl SimulatedSequence {
+    /// Renders the sequence. All cameras expose simultaneously.
     pub fn simulate(gpu: &GpuContext, config: SequenceConfig) -> Result<Self> {
         Self::simulate_shifted(gpu, config, &[])
     }
 
-    /// As [`Self::simulate`], with input camera `i` (in the order of use) exposing `shifts[i]` nanoseconds after the
-    /// instant, and telling so.
+    /// Renders the sequence with input camera `i` (in order of use) exposing `shifts[i]` nanoseconds after the instant, as its
+    /// timestamps say.
     pub fn simulate_shifted(gpu: &GpuContext, config: SequenceConfig, shifts: &[i64]) -> Result<Self> {
         let turn_secs = (config.frames as f64 / config.fps * 6.0).clamp(2.0, 60.0);
         let mut simulator = Simulator::new(
@@ -75,8 +75,8 @@ impl Sequence {
             &SimConfig {
                 seed: config.seed,
                 motion: match config.motion {
-                    Motion::Turn => MotionConfig { turn_secs, ..MotionConfig::default() },
-                    Motion::Still => MotionConfig { kind: MotionKind::Still, ..MotionConfig::default() },
+                    SequenceMotion::Turn => MotionConfig { turn_secs, ..MotionConfig::default() },
+                    SequenceMotion::Still => MotionConfig { kind: MotionKind::Still, ..MotionConfig::default() },
                 },
                 cameras: RingConfig { count: 12, ..RingConfig::default() },
                 width: config.side,
@@ -117,24 +117,24 @@ impl Sequence {
         Ok(Self { config, rig, template, track, frames, truth, depths, plates })
     }
 
-    /// What was simulated.
+    /// Returns the parameters of the simulation.
     pub fn config(&self) -> SequenceConfig {
         self.config
     }
 
-    /// The first `views` input cameras.
+    /// Returns the rig of the first `views` input cameras.
     pub fn inputs(&self, views: usize) -> Rig {
         let mut rig = self.rig.clone();
         rig.cameras = INPUTS.iter().take(views).map(|&slot| self.rig.cameras[slot].clone()).collect();
         rig
     }
 
-    /// The room without people, as the first `views` input cameras see it.
+    /// Returns images of the empty room by the first `views` input cameras.
     pub fn plates(&self, views: usize) -> Result<Vec<Option<Image>>> {
         INPUTS.iter().take(views).map(|&slot| Ok(Some(copy(&self.plates[slot])?))).collect()
     }
 
-    /// What these cameras give at every instant.
+    /// Iterates over the frame sets of the first `views` input cameras.
     pub fn sets(&self, views: usize) -> impl Iterator<Item = FrameSet> + '_ {
         let fps = self.config.fps;
         self.frames.iter().enumerate().map(move |(index, row)| FrameSet {
@@ -144,7 +144,7 @@ impl Sequence {
         })
     }
 
-    /// Held-out cameras and their images at an instant.
+    /// Returns the held-out cameras with their frames at an instant.
     pub fn held_out(&self, index: usize) -> Result<Vec<(&Camera, Arc<Frame>)>> {
         let row = self.frames.get(index).context("no such instant")?;
         let one = |slot: usize| Some((&self.rig.cameras[slot], row[slot].clone()?));

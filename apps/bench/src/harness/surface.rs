@@ -7,10 +7,10 @@ use rayon::prelude::*;
 
 /// Side of a cell of the search grid, metres.
 const CELL_M: f32 = 0.02;
-/// Cells searched in each direction; what is farther counts as that far.
+/// Cells searched in each direction; larger distances are clamped to it.
 const REACH_CELLS: i32 = 8;
 
-/// Points evenly over a surface, ready to be searched.
+/// Points spread evenly over a surface, in a search grid.
 #[derive(Debug, Clone)]
 pub struct Points {
     pub points: Vec<Vec3>,
@@ -18,8 +18,8 @@ pub struct Points {
 }
 
 impl Points {
-    /// About `count` points by area, at places that follow each other like an additive recurrence, so that the same
-    /// surface has the same points.
+    /// Spreads about `count` points over a surface by area, placed by an additive recurrence, so that the same surface has the same
+    /// points.
     pub fn on(positions: &[Vec3], triangles: &[[u32; 3]], count: usize) -> Self {
         let corners = |t: &[u32; 3]| {
             let corner = |i: u32| positions.get(i as usize).copied().filter(|p| p.is_finite());
@@ -50,7 +50,7 @@ impl Points {
         Self { points, cells }
     }
 
-    /// Distance to the nearest point, metres.
+    /// Returns the distance to the nearest point, metres.
     pub fn distance(&self, from: Vec3) -> f64 {
         let home = cell(from);
         let mut best = f32::INFINITY;
@@ -75,13 +75,13 @@ impl Points {
         f64::from(best.min(REACH_CELLS as f32 * CELL_M))
     }
 
-    /// Mean distance of `others` to these, metres; 0 for none.
+    /// Returns the mean distance of `others` to these points, metres; 0 without others.
     pub fn mean_distance(&self, others: &[Vec3]) -> f64 {
         let distances: Vec<f64> = others.par_iter().map(|&point| self.distance(point)).collect();
         distances.iter().sum::<f64>() / distances.len().max(1) as f64
     }
 
-    /// Those that `keep`.
+    /// Returns the points for which `keep` is true.
     pub fn filter(&self, keep: impl Fn(DVec3) -> bool) -> Vec<Vec3> {
         self.points.iter().copied().filter(|p| keep(p.as_dvec3())).collect()
     }

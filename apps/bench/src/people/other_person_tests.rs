@@ -1,4 +1,4 @@
-//! Whoever comes after somebody has left is measured again.
+//! A new person is measured again after another one has left.
 
 use std::sync::Arc;
 
@@ -8,7 +8,7 @@ use flyrig_gpu::{AdapterChoice, GpuContext};
 use flyrig_sim::{Build, MotionConfig, MotionKind, PersonConfig, RingConfig, SimConfig, Simulator};
 use flyrig_types::{Frame, FrameSet, Image};
 
-/// Time from set to set while somebody is seen, and while nobody is.
+/// Time between frame sets while a person is visible, and while none is.
 const STEP_NANOS: i64 = 200_000_000;
 const EMPTY_STEP_NANOS: i64 = 600_000_000;
 
@@ -26,7 +26,7 @@ fn simulator(gpu: &GpuContext, build: Build) -> Simulator {
     Simulator::new(gpu, &config).unwrap()
 }
 
-/// The rig's images, at a time of the simulation or of the empty room.
+/// Renders the frame set at a time of the simulation, or of the empty room.
 fn set(simulator: &mut Simulator, index: u64, nanos: i64, shown: Option<i64>) -> FrameSet {
     let slots: Vec<usize> = (0..simulator.rig().cameras.len()).collect();
     let images: Vec<Image> = match shown {
@@ -49,7 +49,7 @@ struct Studio {
 }
 
 impl Studio {
-    /// Shows somebody, or the empty room, in some sets; returns the shape's number and the template's leg length, metres.
+    /// Shows a person, or the empty room, in some frame sets; returns the number of the shape and the template's leg length, metres.
     fn show(&mut self, simulator: &mut Simulator, sets: i64, is_empty: bool) -> Option<(u32, f64)> {
         for step in 0..sets {
             let shown = (!is_empty).then_some(step * STEP_NANOS);

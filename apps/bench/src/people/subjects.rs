@@ -1,7 +1,7 @@
-//! `flyrig-bench subjects`: several people in one scene, with the views and the cost beside those of one person.
+//! `flyrig-bench subjects`: views and run time with several people in one scene, compared with one person.
 //!
-//! Simulated people of one rig are composited by depth, so that they hide each other as they would in one room. Each person's
-//! colours are also compared alone and in the scene, on the same pixels: those that show the person in the scene.
+//! Simulated people of one rig are composited by depth, so that they occlude each other as in one room. The colours of each person are
+//! also compared alone and in the scene, on the pixels that show the person in the scene.
 
 use std::{collections::BTreeMap, path::Path, time::Instant};
 
@@ -33,8 +33,7 @@ pub struct BenchSubjectsArgs {
     /// People in the scene: one waves, the others turn or walk.
     #[arg(long, default_value_t = 2, value_parser = clap::value_parser!(u8).range(2..=4).map(usize::from))]
     pub people: usize,
-    /// Poses, shapes and masks from the simulator, or from the images. In the latter case all but the first walk, and it is counted
-    /// how often the tracks change places.
+    /// Source of poses, shapes and masks. With "estimated" all people but the first walk, and track swaps are counted.
     #[arg(long, value_enum, default_value = "given")]
     pub pose: Origin,
     /// Frames of the sequence; the second half is scored.
@@ -48,40 +47,40 @@ pub struct BenchSubjectsArgs {
     pub surface: GaussiansArgs,
 }
 
-/// Half of the distance between two people, metres; of a person from the middle of another one's walk.
+/// Half of the distance between two people, and between a person and the middle of another one's walk, metres.
 const APART_M: f64 = 0.45;
 const WALK_APART_M: f64 = 0.7;
-/// Coverage from which on a pixel shows somebody.
+/// Smallest coverage of a pixel that shows a person.
 const COVERED: u8 = 128;
 
-/// One way of tracking.
+/// Result of tracking some of the people.
 struct Row {
     name: String,
     psnr_db: f64,
     iou: f64,
-    /// PSNR on the pixels that show each of the chosen people in the scene of all.
+    /// PSNR by tracked person, on the pixels that show this person in the complete scene.
     own_db: Vec<f64>,
     tracks: Tracks,
-    /// Milliseconds a set, and of one drawn view.
+    /// Milliseconds per frame set, and per rendered view.
     set_ms: f64,
     view_ms: f64,
 }
 
-/// How estimated people were followed.
+/// Counts of the tracks of estimated people.
 #[derive(Default)]
 struct Tracks {
-    /// Which simulated person each id was on last.
+    /// Simulated person that each track followed last.
     on: BTreeMap<PersonId, usize>,
-    /// Times that an id changed to another simulated person.
+    /// Track changes to another simulated person.
     swaps: usize,
-    /// Sets in which a person was on nobody's track.
+    /// Frame sets in which a person had no track.
     missed: usize,
-    /// Distance of the hips from the true ones, millimetres.
+    /// Errors of the hips, millimetres.
     hips_mm: Vec<f64>,
 }
 
 impl Tracks {
-    /// Compares the tracked people with the simulated ones at a time.
+    /// Compares the tracked people with the simulated ones at an instant.
     fn add(&mut self, session: &Session, people: &[Simulator], chosen: &[usize], nanos: i64) {
         let mut found = Vec::new();
         for subject in session.subjects().iter().filter(|subject| subject.watch().state() != TrackState::Lost) {
@@ -141,7 +140,7 @@ pub fn subjects(args: &BenchSubjectsArgs, gpu: &GpuContext) -> Result<()> {
     Ok(())
 }
 
-/// Two people stand side by side; more stand or walk at equal distances around the middle.
+/// Simulates one of the people: two stand side by side, more stand or walk at equal distances around the middle.
 fn simulator(gpu: &GpuContext, args: &BenchSubjectsArgs, who: usize) -> Result<Simulator> {
     let apart = if args.pose == Origin::Given { APART_M } else { WALK_APART_M };
     let turn = std::f64::consts::PI + std::f64::consts::TAU * who as f64 / args.people as f64;
@@ -174,7 +173,7 @@ fn simulator(gpu: &GpuContext, args: &BenchSubjectsArgs, who: usize) -> Result<S
 struct Squares(f64, usize);
 
 impl Squares {
-    /// Adds the pixels of a view over black that show `who` where everybody is in the scene.
+    /// Adds the pixels of a view over black that show `who` in the complete scene.
     fn add(&mut self, view: &RenderedView, truth: &Image, (everybody, shown): (&Mask, &[usize]), who: usize) {
         let pixels = view.rgba.chunks_exact(4).zip(truth.bytes().chunks_exact(3));
         for ((ours, theirs), (cover, shown)) in pixels.zip(everybody.coverage().iter().zip(shown)) {
@@ -267,7 +266,7 @@ fn run(
     })
 }
 
-/// Looks for the chosen people with the empty room known, and measures them in the first seconds.
+/// Creates a perception that knows the empty room, and measures the chosen people in the first seconds.
 fn find_people(people: &mut [Simulator], chosen: &[usize], rig: &Rig, inputs: &Rig) -> Result<EstimatedPerception> {
     let settings = PerceptionSettings { people: chosen.len(), ..PerceptionSettings::default() };
     let plate = |&slot: &usize| -> Result<Option<Image>> { Ok(Some(copy(people[0].plate(slot)?)?)) };
@@ -281,7 +280,7 @@ fn find_people(people: &mut [Simulator], chosen: &[usize], rig: &Rig, inputs: &R
     Ok(perception)
 }
 
-/// State and quality of everybody, for the log.
+/// Writes state and quality of every person.
 fn write_subjects(out: &Path, name: &str, session: &Session) -> Result<()> {
     let line = |subject: &Subject| {
         let watch = subject.watch();

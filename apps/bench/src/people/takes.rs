@@ -1,4 +1,4 @@
-//! `flyrig-bench takes`: several people who walk past one another, again and again, and whether each keeps one track.
+//! `flyrig-bench takes`: track swaps in many takes of people who walk past one another.
 
 use std::{collections::BTreeMap, time::Instant};
 
@@ -26,7 +26,7 @@ use glam::DVec3;
 #[derive(Debug, Args)]
 #[command(mut_arg("out", |arg| arg.default_value("out/bench-takes")), mut_arg("seed", |arg| arg.default_value("601")), mut_arg("side", |arg| arg.default_value("384")), mut_arg("fps", |arg| arg.default_value("10")))]
 pub struct BenchTakesArgs {
-    /// How many takes, each with people and a room of its own.
+    /// Number of takes, each with its own people and room.
     #[arg(long, default_value_t = 20, value_parser = clap::value_parser!(u64).range(1..=1000))]
     pub takes: u64,
     /// People in each take: one stays in the middle, the others walk around.
@@ -35,7 +35,7 @@ pub struct BenchTakesArgs {
     /// Seconds of a take.
     #[arg(long, default_value_t = 5.0, value_parser = parse_seconds)]
     pub secs: f64,
-    /// The last person leaves 3 s after the start, for so many seconds; nobody leaves otherwise.
+    /// Seconds that the last person is absent, from 3 s after the start on; no person leaves otherwise.
     #[arg(long, value_parser = parse_seconds)]
     pub away_secs: Option<f64>,
     #[command(flatten)]
@@ -46,30 +46,30 @@ pub struct BenchTakesArgs {
     pub rate: FpsArgs,
 }
 
-/// A track farther than this from everybody follows nobody, metres.
+/// Largest distance of a track from the person whom it follows, metres.
 const ON_SOMEBODY_M: f64 = 0.4;
-/// Everybody must be on a track from this time on, seconds: people are measured for 1.5 s first.
+/// Time from which on every person must have a track, seconds: people are measured for 1.5 s first.
 const ARRIVAL_SECS: f64 = 2.0;
-/// When the last person leaves, where it does, and the time after its return that the search for it may take, seconds.
+/// Time at which the last person leaves, and time for the search after the return, seconds.
 const LEAVES_SECS: f64 = 3.0;
 const RETURN_SECS: f64 = 1.0;
 
 /// Counts of one take.
 #[derive(Debug, Default)]
 struct Take {
-    /// Changes of a track to another person.
+    /// Track changes to another person.
     swaps: usize,
-    /// Sets in which a person was on no track, and all of people and sets, after [`ARRIVAL_SECS`].
+    /// Frame sets without a track for a person, and all pairs of person and frame set, after [`ARRIVAL_SECS`].
     missed: usize,
     all: usize,
-    /// Sets in which a track followed nobody.
+    /// Frame sets in which a track followed no person.
     astray: usize,
     hips_mm: Vec<f64>,
     secs: f64,
     sets: usize,
-    /// Who each track followed last.
+    /// Person that each track followed last.
     on: BTreeMap<PersonId, usize>,
-    /// Returns of the person who went away to the track from before, and returns to another one.
+    /// Returns of the absent person to the same track, and to another one.
     same: usize,
     other: usize,
 }
@@ -125,8 +125,7 @@ impl Take {
         self.sets += other.sets;
     }
 
-    /// Compares the tracks of a set with the true places of the people who are there.
-    /// Returns the tracks by the people whom they follow.
+    /// Compares the tracks of a frame set with the true positions of the people. Returns the track by person.
     fn compare(
         &mut self,
         tracks: &[(PersonId, DVec3)],
@@ -204,7 +203,7 @@ fn run(args: &BenchTakesArgs, gpu: &GpuContext, seed: u64, sets: u64, bar: &indi
     Ok(take)
 }
 
-/// The first person waves in the middle, the others walk on a circle around at equal distances.
+/// Simulates one of the people: the first waves in the middle, the others walk around on a circle at equal distances.
 fn simulator(gpu: &GpuContext, args: &BenchTakesArgs, seed: u64, who: usize) -> Result<Simulator> {
     let motion = MotionConfig {
         kind: if who == 0 { MotionKind::Wave } else { MotionKind::Walk },

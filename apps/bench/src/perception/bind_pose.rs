@@ -1,4 +1,4 @@
-//! Distance between two bodies in their bind poses, whatever their poses in the images were.
+//! Distance between two bodies in their bind poses.
 
 use std::collections::BTreeMap;
 
@@ -6,15 +6,15 @@ use crate::harness::{joints::JOINTS, surface::Points};
 use flyrig_body::Template;
 use glam::{DVec3, Vec3};
 
-/// Points on each surface that are measured, and those that they are measured to: 2 mm apart, so that the surface itself counts
-/// as 1 mm away.
+/// Measured points on each surface, and points that they are measured to: about 2 mm apart, so that the distance of a surface to itself
+/// is 1 mm.
 const MEASURED: usize = 20_000;
 const DENSE: usize = 500_000;
 
-/// Mean distance of the surfaces of two bodies in their bind poses, half of the sum of both directions, millimetres.
+/// Returns the mean distance of the surfaces of two bodies in their bind poses, averaged over both directions, millimetres.
 ///
-/// The bodies are moved such that the means of the [`JOINTS`] that both have coincide, and are not turned: both must be bound in
-/// about the same pose, as bodies with the joints of the built-in one are. `None` without a common joint.
+/// The bodies are translated so that the centroids of their common [`JOINTS`] coincide, and are not rotated: both need about the same
+/// bind pose, like bodies with the joints of the built-in one. `None` without a common joint.
 pub(crate) fn surface_mm(ours: &Template, truth: &Template) -> Option<f64> {
     let (own, theirs) = (origins(ours), origins(truth));
     let offsets: Vec<DVec3> = JOINTS.iter().filter_map(|name| Some(*theirs.get(name)? - *own.get(name)?)).collect();
@@ -31,13 +31,13 @@ pub(crate) fn surface_mm(ours: &Template, truth: &Template) -> Option<f64> {
     Some(0.5e3 * (own_dense.mean_distance(&theirs.points) + their_dense.mean_distance(&own.points)))
 }
 
-/// Extent of the bind pose along y, metres.
+/// Returns the extent of the bind pose along y, metres.
 pub(crate) fn height_m(template: &Template) -> f32 {
     let heights = || template.positions.iter().map(|position| position.y);
     heights().fold(f32::NEG_INFINITY, f32::max) - heights().fold(f32::INFINITY, f32::min)
 }
 
-/// Places of the joints in the bind pose, by name.
+/// Returns the positions of the joints in the bind pose, by name.
 fn origins(template: &Template) -> BTreeMap<&str, DVec3> {
     let names = template.skeleton.joints().iter().map(|joint| joint.name.as_str());
     names.zip(template.skeleton.canonical_origins()).collect()

@@ -1,4 +1,4 @@
-//! Somebody who moves is followed from the second set on, before any speed is known.
+//! A moving person is tracked from the second frame set on, before any speed is known.
 
 use std::sync::Arc;
 

@@ -23,35 +23,35 @@ pub struct BenchHandsArgs {
     /// Lengths of the hands in the images, pixels, comma separated.
     #[arg(long, value_delimiter = ',', default_value = "20,40,80")]
     pub px: Vec<f64>,
-    /// Seed of the first person; the others follow.
+    /// Seed of the first person; further people have the following seeds.
     #[arg(long, default_value_t = 401)]
     pub seed: u64,
-    /// How many people.
+    /// Number of people.
     #[arg(long, default_value_t = 4, value_parser = clap::value_parser!(u64).range(1..=1000))]
     pub people: u64,
     /// Frame sets of each person, 0.2 seconds apart.
     #[arg(long, default_value_t = 12, value_parser = clap::value_parser!(u64).range(1..=1000))]
     pub frames: u64,
-    /// Cameras on a ring of 3 metres.
+    /// Number of cameras on a ring of 3 m radius.
     #[arg(long, default_value_t = 4, value_parser = clap::value_parser!(u8).range(1..=32).map(usize::from))]
     pub cameras: usize,
     /// ONNX file of another hand network with the same outputs.
     #[arg(long)]
     pub hand_net: Option<PathBuf>,
-    /// Folder for the images of each person's first set.
+    /// Folder for the images of the first frame set of each person.
     #[arg(long)]
     pub images: Option<PathBuf>,
-    /// Learns the face's points instead and prints their table, at the largest of the lengths.
+    /// Estimate the positions of the face's landmarks instead and print their table, at the largest of the lengths.
     #[arg(long)]
     pub learn_face: bool,
 }
 
-/// Length of a hand that image sizes are computed from, metres.
+/// Length of a hand, from which image sizes are computed, metres.
 const HAND_M: f64 = 0.18;
 /// Distance of the cameras, metres, and their focal length in image heights.
 const RADIUS_M: f64 = 3.0;
 const FOCAL_HEIGHTS: f64 = 1.36;
-/// Seconds between the sets that are measured: each shows other fingers.
+/// Seconds between measured frame sets: each shows other fingers.
 const SET_SECS: f64 = 0.2;
 /// Motions, by person.
 const MOTIONS: [MotionKind; 4] = [MotionKind::Wave, MotionKind::Turn, MotionKind::Reach, MotionKind::Dance];
@@ -60,12 +60,12 @@ const BODY_JOINTS: usize = 31;
 /// Fingertips among the landmarks.
 const TIPS: [usize; 5] = [4, 8, 12, 16, 20];
 
-/// Errors of one way to get hands and head.
+/// Errors of one way to estimate hands and head.
 #[derive(Debug, Clone, Default)]
 struct Errors {
     /// Distances of fingertips relative to their wrists, millimetres.
     tips_mm: Vec<f64>,
-    /// The same of hands whose fingers were fitted.
+    /// Distances of hands whose fingers were fitted, millimetres.
     fitted_mm: Vec<f64>,
     head_deg: Vec<f64>,
     head_fitted_deg: Vec<f64>,
@@ -115,7 +115,7 @@ pub fn hands(args: &BenchHandsArgs, gpu: &GpuContext) -> Result<()> {
     Ok(())
 }
 
-/// A simulated person whose hands are `px` pixels long.
+/// Simulates a person whose hands are `px` pixels long.
 fn person(args: &BenchHandsArgs, gpu: &GpuContext, px: f64, person: u64) -> Result<Simulator> {
     let height = (px * RADIUS_M / (HAND_M * FOCAL_HEIGHTS)).round().clamp(16.0, 4096.0) as u32;
     let kind = MOTIONS[person as usize % MOTIONS.len()];
@@ -149,7 +149,7 @@ fn frame_set(simulator: &mut Simulator, index: u64) -> Result<FrameSet> {
     Ok(FrameSet { index, master_nanos: nanos, frames: pictures.into_iter().enumerate().map(frame).collect() })
 }
 
-/// The pose without its fingers.
+/// Returns the pose without its fingers.
 fn body_of(pose: &Pose) -> Pose {
     Pose { joint_rotations: pose.joint_rotations.iter().copied().take(BODY_JOINTS).collect(), ..pose.clone() }
 }
@@ -253,7 +253,7 @@ fn print_row(px: f64, cameras: usize, name: &str, errors: &Errors) {
     );
 }
 
-/// Prints the time that each network takes for a crop, on one thread.
+/// Measures and prints the run time of each network per crop, on one thread.
 fn cost(hand_net: &HandNet) -> Result<()> {
     const RUNS: u32 = 20;
     let face_net = FaceNet::embedded()?;
@@ -272,7 +272,7 @@ fn cost(hand_net: &HandNet) -> Result<()> {
     Ok(())
 }
 
-/// Writes the images of a set with the landmarks of the estimated hands as green dots.
+/// Writes the images of a frame set with the landmarks of the estimated hands as green dots.
 fn pictures(
     folder: &std::path::Path,
     name: &str,
@@ -302,7 +302,7 @@ fn pictures(
     Ok(())
 }
 
-/// Prints the table of `tracker/src/hands/face_points.rs`.
+/// Estimates and prints the table of the face's landmarks in `tracker/src/hands/face_points.rs`.
 fn learn_face(args: &BenchHandsArgs, gpu: &GpuContext) -> Result<()> {
     let mut study = FaceStudy::new(FaceNet::embedded()?);
     let px = args.px.iter().copied().fold(0.0, f64::max);

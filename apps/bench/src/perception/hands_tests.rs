@@ -1,4 +1,4 @@
-//! Fingers of a simulated person through the live system's perception.
+//! Fingers of a simulated person estimated by the perception of the live system.
 
 use std::sync::Arc;
 

@@ -18,7 +18,7 @@ pub struct BenchLandmarksArgs {
     /// Data sets with an animated glTF body, as `flyrig sim export` writes them; all of their cameras are used.
     #[arg(required = true)]
     pub datasets: Vec<PathBuf>,
-    /// Only every so many frames.
+    /// Interval of the used frames.
     #[arg(long, default_value_t = 1, value_parser = clap::value_parser!(u64).range(1..))]
     pub every: u64,
     #[command(flatten)]

@@ -8,7 +8,7 @@ use flyrig_metrics::mask_iou;
 use flyrig_types::Mask;
 use serde::Serialize;
 
-/// Half of the width of the band around the true outline in which alpha is compared, pixels.
+/// Half width of the band around the true outline in which alpha is compared, pixels.
 const BAND_PX: i64 = 3;
 
 /// Means over images.
@@ -16,7 +16,7 @@ const BAND_PX: i64 = 3;
 pub struct MaskErrors {
     /// Intersection over union.
     pub iou: f64,
-    /// Harmonic mean of the shares of our outline within a pixel of the true one, and of the true one within a pixel of ours.
+    /// Harmonic mean of the fraction of the estimated outline within one pixel of the true one, and vice versa.
     pub boundary_f: f64,
     /// Mean absolute error of alpha in a band of 3 pixels around the true outline.
     pub band_alpha: f64,
@@ -25,7 +25,7 @@ pub struct MaskErrors {
 }
 
 impl MaskErrors {
-    /// Adds an input image with our coverage in its alpha channel.
+    /// Adds an input image with the estimated coverage in its alpha channel.
     pub fn add(&mut self, rgba: &[u8], truth: &Mask) {
         let Some(ours) = coverage(rgba, truth) else { return };
         let Ok(iou) = mask_iou(&ours, truth) else { return };
@@ -56,7 +56,7 @@ impl MaskErrors {
     }
 }
 
-/// Writes an image in grey, red where our coverage is too small and blue where it is too large.
+/// Writes an image in grey, red where the estimated coverage is too small and blue where it is too large.
 ///
 /// # Errors
 /// Names the file that cannot be written.
@@ -74,7 +74,7 @@ pub fn write_errors(path: &Path, rgba: &[u8], truth: &Mask) -> Result<()> {
     image.save(path).with_context(|| format!("cannot write {}", path.display()))
 }
 
-/// Pixels inside of a mask with a neighbour outside.
+/// Pixels inside a mask with a neighbour outside.
 struct Edge {
     width: i64,
     height: i64,
@@ -100,7 +100,7 @@ impl Edge {
         span(y, self.height).any(|y| span(x, self.width).any(|x| self.on[(y * self.width + x) as usize]))
     }
 
-    /// Share of this outline's pixels that lie within `reach` pixels of another's.
+    /// Returns the fraction of this outline's pixels within `reach` pixels of another outline.
     fn share_near(&self, other: &Self, reach: i64) -> f64 {
         let (mut near, mut all) = (0usize, 0usize);
         for at in (0..self.on.len()).filter(|&at| self.on[at]) {

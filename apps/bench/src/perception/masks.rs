@@ -1,4 +1,4 @@
-//! `flyrig-bench masks`: estimates masks in each camera independently, so that several calibrations are scored against the same masks.
+//! `flyrig-bench masks`: masks estimated in each camera independently, against which several calibrations are scored.
 
 use anyhow::{Context as _, Result};
 use clap::Args;

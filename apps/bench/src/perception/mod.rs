@@ -1,7 +1,6 @@
-//! `flyrig-bench perception`: errors of pose, shape and masks from images, and what each costs in the views.
+//! `flyrig-bench perception`: errors of pose, shape and masks from images, and the error in the views that each causes.
 //!
-//! Every part of the input (pose, shape, masks) is given or estimated by itself, so that the table shows where the error of
-//! the whole comes from.
+//! Pose, shape and masks are each given or estimated, so that the table attributes the total error to them.
 
 mod bind_pose;
 #[cfg(test)]
@@ -21,7 +20,7 @@ use std::{
 };
 
 use crate::harness::{
-    arguments::ReplayArgs,
+    arguments::RecordedArgs,
     joints::{JOINTS, places},
     statistics::{mean, percentile},
 };
@@ -45,31 +44,30 @@ pub struct BenchPerceptionArgs {
     /// Data sets with true masks and an animated glTF body, as `flyrig sim export` writes them.
     #[arg(required = true)]
     pub datasets: Vec<PathBuf>,
-    /// Only these rows: letters of pose, shape and masks, g for given and e for estimated, comma separated.
+    /// Run only these rows: letters of pose, shape and masks, g for given and e for estimated, comma separated.
     #[arg(long, value_delimiter = ',')]
     pub only: Vec<String>,
-    /// Parts of the names of joints whose orientation is the true one, or "place" for the true position, comma separated: what a part
-    /// of the pose costs. For the rows with an estimated pose and the given shape.
+    /// Joints, by parts of their names, whose orientations are replaced by the true ones, or "place" for the true position, comma
+    /// separated. For rows with an estimated pose and the given shape.
     #[arg(long, value_delimiter = ',')]
     pub true_joints: Vec<String>,
-    /// Leaves out the deformation and the views: poses, shapes and masks alone, in a fraction of the time.
+    /// Skip the deformation and the views: poses, shapes and masks alone, in a fraction of the time.
     #[arg(long)]
     pub no_views: bool,
-    /// `perception.look_after_m`: how far the body moves in a view until the network looks at that view again, metres.
+    /// Value of `perception.look_after_m`: motion of the body in a view before the network runs on that view again, metres.
     #[arg(long)]
     pub look_after_m: Option<f64>,
-    /// Folder of the plates CAM.png; an empty one measures without plates. The data set's own by default.
+    /// Folder of the plates CAM.png, by default that of the data set; an empty folder measures without plates.
     #[arg(long, value_name = "FOLDER")]
     pub plates: Option<PathBuf>,
-    /// Writes a picture of every so many sets' masks beside the results: red where the person is missing, blue where the mask
-    /// is too large.
+    /// Interval of the frame sets whose masks are written as images: red where the mask is too small, blue where it is too large.
     #[arg(long, value_name = "SETS", value_parser = clap::value_parser!(u64).range(1..))]
     pub mask_pictures: Option<u64>,
-    /// Description of a landmark network to use in place of the one built in.
+    /// Description of a landmark network that replaces the built-in one.
     #[arg(long, value_name = "FILE")]
     pub network: Option<PathBuf>,
     #[command(flatten)]
-    pub replay: ReplayArgs,
+    pub replay: RecordedArgs,
     #[command(flatten)]
     pub output: OutputArgs,
     #[command(flatten)]
@@ -105,13 +103,13 @@ struct Row {
     lost: u64,
     joint_mean_mm: f64,
     joint_p95_mm: f64,
-    /// Mean change of a joint's error from frame to frame.
+    /// Mean change of the error of a joint from frame to frame.
     jitter_mm: f64,
-    /// Mean over the frames, by joint.
+    /// Mean error by joint.
     joints_mm: BTreeMap<String, f64>,
-    /// Mean angle between our parts and the true ones, by joint.
+    /// Mean angle between the estimated and the true orientation, by joint.
     turns_deg: BTreeMap<String, f64>,
-    /// Distance of our body without clothes in its bind pose from the true one, and of the average body from it, millimetres.
+    /// Distances from the true body in the bind pose, millimetres: of the estimated body without clothes, and of the average body.
     shape_mm: Option<f64>,
     average_shape_mm: Option<f64>,
     masks: MaskErrors,
@@ -140,7 +138,7 @@ pub fn perception(args: &BenchPerceptionArgs, gpu: &GpuContext) -> Result<()> {
     Ok(())
 }
 
-/// Letters of the sources, pose first: "gee" is a given pose with estimated shape and masks.
+/// Returns the letters of the sources of pose, shape and masks: "gee" is a given pose with estimated shape and masks.
 fn code(inputs: Inputs) -> String {
     let letter = |origin| if origin == Origin::Given { 'g' } else { 'e' };
     [inputs.pose, inputs.shape, inputs.masks].map(letter).iter().collect()
@@ -249,12 +247,12 @@ fn frame_of<'a>(set: &'a FrameSet, camera: &str) -> Option<&'a Frame> {
     set.present().map(|(_, frame)| frame.as_ref()).find(|frame| frame.camera.as_str() == camera)
 }
 
-/// Distances of joints from the true ones.
+/// Errors of joints.
 #[derive(Debug, Default)]
 struct JointErrors {
-    /// World vectors, millimetres, by joint and frame.
+    /// Error vectors by joint and frame, world axes, millimetres.
     by_joint: BTreeMap<String, Vec<DVec3>>,
-    /// Angle between our part and the true one, degrees.
+    /// Angles to the true orientation by joint and frame, degrees.
     turns: BTreeMap<String, Vec<f64>>,
 }
 
@@ -290,7 +288,7 @@ impl JointErrors {
         self.turns.iter().map(|(name, errors)| (name.clone(), mean(errors))).collect()
     }
 
-    /// Mean change of an error from frame to frame.
+    /// Returns the mean change of an error from frame to frame, millimetres.
     fn jitter_mm(&self) -> f64 {
         let changes = |errors: &Vec<DVec3>| errors.windows(2).map(|w| w[1].distance(w[0])).collect::<Vec<_>>();
         mean(&self.by_joint.values().flat_map(changes).collect::<Vec<_>>())

@@ -1,7 +1,7 @@
 //! `flyrig-bench stress`: disturbances of perception, one at a time, with everything estimated from images.
 //!
-//! Every case is one simulated person in front of a rig: calm, then the disturbance, then calm again. Joints are compared
-//! with the true ones, and the time from the end of the disturbance until they are as near as before is the recovery.
+//! Every case is one simulated person in front of a rig: undisturbed, disturbed, and undisturbed again. Joints are compared with the true
+//! ones; the recovery is the time from the end of the disturbance until their error is as small as before.
 
 use std::{collections::BTreeMap, path::Path, sync::Arc};
 
@@ -30,10 +30,10 @@ use glam::{DQuat, DVec3};
 #[derive(Debug, Args)]
 #[command(mut_arg("out", |arg| arg.default_value("out/bench-stress")), mut_arg("seed", |arg| arg.default_value("501")), mut_arg("side", |arg| arg.default_value("384")), mut_arg("fps", |arg| arg.default_value("10")))]
 pub struct BenchStressArgs {
-    /// Only the cases whose names contain one of these texts, comma separated.
+    /// Run only cases whose names contain one of these texts, comma separated.
     #[arg(long, value_delimiter = ',')]
     pub only: Vec<String>,
-    /// Cameras on a ring of 3 metres.
+    /// Number of cameras on a ring of 3 m radius.
     #[arg(long, default_value_t = 3, value_parser = clap::value_parser!(u8).range(1..=16).map(usize::from))]
     pub cameras: usize,
     #[command(flatten)]
@@ -46,37 +46,37 @@ pub struct BenchStressArgs {
 
 /// Colour of a mask's outline.
 const OUTLINE: [u8; 3] = [0, 255, 80];
-/// Sets after the disturbance whose errors are compared with those before it, seconds.
+/// Measured time after the disturbance, seconds.
 const AFTER_SECS: f64 = 2.0;
-/// Somebody is measured for 1.5 s first.
+/// Time before the disturbance, seconds; a person is measured for 1.5 s first.
 const BEFORE_SECS: f64 = 3.0;
-/// Joints are as near as before again below this multiple of the error before, and this error at least.
+/// Threshold of the recovery: multiple of the joint error before, and smallest threshold, millimetres.
 const RECOVERED: (f64, f64) = (1.5, 30.0);
 
-/// Disturbance between two calm periods.
+/// Disturbance between two undisturbed periods.
 #[derive(Debug, Clone, Copy, PartialEq)]
 enum Disturbance {
-    /// Nothing but the movement itself.
+    /// The motion itself.
     Motion,
-    /// The person stands so far from the middle, metres: parts leave the images.
+    /// Distance of the person from the middle, metres: parts leave the images.
     OffCentre(f64),
-    /// A camera gives black images.
+    /// Black images of one camera.
     Covered,
-    /// A camera gives nothing.
+    /// No frames of one camera.
     Missing,
-    /// All cameras give black images.
+    /// Black images of all cameras.
     Dark,
-    /// The lamps fall to this part of their light.
+    /// Factor on the light of the lamps.
     Lights(f64),
-    /// A camera's exposure jumps by this factor.
+    /// Factor on the exposure of one camera.
     Exposure(f64),
-    /// Somebody walks past.
+    /// A second person who walks past.
     PasserBy,
-    /// Below the neck, this share of the difference between the person and the background is left.
+    /// Fraction of the difference between person and background that is left below the neck.
     Camouflaged(f64),
-    /// Nobody is there.
+    /// An empty room.
     Away,
-    /// Nobody is there, then somebody of another build.
+    /// An empty room, then a person of another build.
     Replaced,
 }
 
@@ -120,10 +120,10 @@ struct Row {
     /// Mean joint errors before, during and after, millimetres; NaN without a pose.
     mm: [f64; 3],
     p95_mm: [f64; 3],
-    /// Sets, and those in which the person was not found, before, during and after.
+    /// Frame sets, and those in which the person was not found, before, during and after.
     sets: [usize; 3],
     lost: [usize; 3],
-    /// Seconds from the end of the disturbance until the joints were as near as before; `None` when they never were.
+    /// Seconds from the end of the disturbance to the recovery; `None` without one.
     recovery_secs: Option<f64>,
     /// Mean mask IoU before, during and after.
     iou: [f64; 3],
@@ -211,14 +211,14 @@ fn simulator(
     Ok(Simulator::new(gpu, &config)?)
 }
 
-/// The image with every sRGB value multiplied.
+/// Multiplies every sRGB value of an image.
 fn scaled(image: &Image, factor: f64) -> Result<Image> {
     let bytes: Vec<u8> =
         image.bytes().iter().map(|&byte| (f64::from(byte) * factor).round().min(255.0) as u8).collect();
     Ok(Image::new(image.width(), image.height(), image.format(), bytes)?)
 }
 
-/// The image with only a share of the difference from the plate left where the mask covers rows from `top` on.
+/// Blends the masked part of an image below row `top` with the plate, so that `share` of their difference is left.
 fn camouflaged(image: &Image, plate: &Image, mask: &Mask, top: usize, share: f64) -> Result<Image> {
     let width = image.width() as usize;
     let mut bytes = image.bytes().to_vec();
@@ -244,7 +244,7 @@ struct Scenes<'a> {
 /// A frame set with its true pose and masks.
 struct Shown {
     set: FrameSet,
-    /// By camera; `None` while the room is empty.
+    /// True masks by camera; `None` while the room is empty.
     truths: Vec<Option<Mask>>,
     joints: BTreeMap<String, (DVec3, DQuat)>,
     is_empty: bool,
@@ -400,7 +400,7 @@ fn run(args: &BenchStressArgs, gpu: &GpuContext, case: &Case, index: usize) -> R
     Ok(tally.into_row(case.name, 1e3 * seconds / total.max(1) as f64))
 }
 
-/// Masks of the views beside the true ones.
+/// Pairs the masks of the views with the true ones.
 fn present_masks<'a>(
     seen: &'a SeenPerson,
     set: &'a FrameSet,
@@ -410,12 +410,12 @@ fn present_masks<'a>(
     views.filter_map(|(view, (slot, _))| view.mask.as_ref().zip(truths.get(slot)?.as_ref()))
 }
 
-/// Distances of the joints that both have, millimetres.
+/// Returns the distances of the joints that both bodies have, millimetres.
 fn joint_error_mm(ours: &BTreeMap<String, (DVec3, DQuat)>, truth: &BTreeMap<String, (DVec3, DQuat)>) -> Vec<f64> {
     JOINTS.iter().filter_map(|name| Some(1e3 * ours.get(*name)?.0.distance(truth.get(*name)?.0))).collect()
 }
 
-/// RGB images of a set with the masks' outlines.
+/// Renders the outlines of the masks into the images of a frame set.
 fn outlined(set: &FrameSet, seen: Option<&SeenPerson>) -> Result<Vec<Image>> {
     let mut images = Vec::new();
     for (at, (_, frame)) in set.present().enumerate() {
@@ -429,7 +429,7 @@ fn outlined(set: &FrameSet, seen: Option<&SeenPerson>) -> Result<Vec<Image>> {
     Ok(images)
 }
 
-/// Writes images side by side, one row a phase.
+/// Writes images side by side, one row per phase.
 fn write_sheet(path: &Path, rows: &[Vec<Image>]) -> Result<()> {
     let Some(first) = rows.first().and_then(|row| row.first()) else { return Ok(()) };
     let (width, height) = (first.width() as usize, first.height() as usize);

@@ -1,9 +1,10 @@
-//! `flyrig-bench scale`: run time and error by pixels, input cameras and Gaussians, one at a time, and pixels and cameras at their most.
+//! `flyrig-bench scale`: run time and error over pixels, input cameras and Gaussians, each by itself, and with the most pixels and
+//! cameras.
 
 use std::{fmt::Write as _, time::Instant};
 
 use crate::harness::{
-    sequence::{Motion, Sequence, SequenceConfig},
+    sequence::{SequenceConfig, SequenceMotion, SimulatedSequence},
     statistics::exponent,
 };
 use anyhow::{Context, Result};
@@ -35,25 +36,25 @@ pub struct BenchScaleArgs {
     /// Frames of a sequence; the first twelve are neither timed nor scored.
     #[arg(long, default_value_t = 24, value_parser = clap::value_parser!(u16).range(13..=1000).map(usize::from))]
     pub frames: usize,
-    /// Pixels of an image's side, comma separated. The first one is that of the other rows.
+    /// Widths and heights of the images, pixels, comma separated. Rows that vary something else use the first.
     #[arg(long, value_delimiter = ',', default_value = "512,256,1024,1440", value_parser = clap::value_parser!(u32).range(64..=2048))]
     pub sides: Vec<u32>,
-    /// Numbers of input cameras, comma separated. The first one is that of the other rows.
+    /// Numbers of input cameras, comma separated. Rows that vary something else use the first.
     #[arg(long, value_delimiter = ',', default_value = "3,2,4,6", value_parser = clap::value_parser!(u8).range(1..=6).map(usize::from))]
     pub views: Vec<usize>,
-    /// Numbers of Gaussians on the person's surface, comma separated. The first one is that of the other rows.
+    /// Numbers of Gaussians on the person's surface, comma separated. Rows that vary something else use the first.
     #[arg(long, value_delimiter = ',', default_value = "115000,29000,58000,230000", value_parser = clap::value_parser!(u32).range(200..=2_000_000).map(|n| n as usize))]
     pub gaussians: Vec<usize>,
     #[command(flatten)]
     pub output: OutputArgs,
 }
 
-/// Sets that are neither timed nor scored: the first ones get more work.
+/// Frame sets that are neither timed nor scored: the first ones get more work.
 const WARM_UP: u64 = 12;
 /// Stage of an estimated person: network, masks and fits, without mattes and backgrounds.
 const POSE: &str = "pose from images";
 
-/// Quantity that grows from row to row.
+/// Quantity that is varied.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize)]
 #[serde(rename_all = "kebab-case")]
 enum Axis {
@@ -62,7 +63,7 @@ enum Axis {
     Gaussians,
 }
 
-/// One size of the work.
+/// Size of the input and of the person.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize)]
 struct Size {
     side: u32,
@@ -73,10 +74,10 @@ struct Size {
 /// Run times and scores of a size.
 #[derive(Debug, Serialize)]
 struct Row {
-    /// The axes along which this size stands; none for pixels and cameras at their most.
+    /// Axes of which this size is a point; none with the most pixels and cameras.
     axes: Vec<Axis>,
     size: Size,
-    /// Means, milliseconds: an estimated pose with its masks, the rest of a set, and a view of the images' size.
+    /// Mean milliseconds of the estimated pose with its masks, of the rest of a frame set, and of a view with the size of the images.
     pose_ms: f64,
     rest_ms: f64,
     view_ms: f64,
@@ -88,15 +89,20 @@ pub fn scale(args: &BenchScaleArgs, gpu: &GpuContext) -> Result<()> {
     args.output.create()?;
     let sizes = sizes(args)?;
     let bar = progress_bar(sizes.len() as u64, "bench scale");
-    let mut sequence: Option<Sequence> = None;
+    let mut sequence: Option<SimulatedSequence> = None;
     let mut rows = Vec::new();
     for (axes, size) in sizes {
         bar.set_message(format!("{}², {} cameras, {} Gaussians", size.side, size.views, size.gaussians));
-        let config =
-            SequenceConfig { motion: Motion::Turn, seed: args.seed, side: size.side, frames: args.frames, fps: 30.0 };
+        let config = SequenceConfig {
+            motion: SequenceMotion::Turn,
+            seed: args.seed,
+            side: size.side,
+            frames: args.frames,
+            fps: 30.0,
+        };
         let scene = match sequence.take().filter(|known| known.config() == config) {
             Some(known) => known,
-            None => Sequence::simulate(gpu, config)?,
+            None => SimulatedSequence::simulate(gpu, config)?,
         };
         rows.push(run(args.pose, gpu, &scene, axes, size)?);
         sequence = Some(scene);
@@ -112,7 +118,7 @@ pub fn scale(args: &BenchScaleArgs, gpu: &GpuContext) -> Result<()> {
     Ok(())
 }
 
-/// The sizes, those of one image side together, so that a sequence is simulated once.
+/// Returns the sizes, those of one image size in succession so that a sequence is simulated once.
 fn sizes(args: &BenchScaleArgs) -> Result<Vec<(Vec<Axis>, Size)>> {
     let first = |known: Option<usize>, what| known.with_context(|| format!("--{what} needs a number"));
     let base = Size {
@@ -139,7 +145,7 @@ fn sizes(args: &BenchScaleArgs) -> Result<Vec<(Vec<Axis>, Size)>> {
     Ok(sizes)
 }
 
-fn session(pose: Origin, gpu: &GpuContext, sequence: &Sequence, size: Size) -> Result<Session> {
+fn session(pose: Origin, gpu: &GpuContext, sequence: &SimulatedSequence, size: Size) -> Result<Session> {
     let rig = sequence.inputs(size.views);
     let settings = SessionSettings { body: BodySettings::with_gaussians(size.gaussians), ..SessionSettings::default() };
     let builder = SessionBuilder::new(gpu.clone(), rig.clone()).settings(settings);
@@ -156,7 +162,7 @@ fn session(pose: Origin, gpu: &GpuContext, sequence: &Sequence, size: Size) -> R
     Ok(builder.perception(perception).build()?)
 }
 
-fn run(pose: Origin, gpu: &GpuContext, sequence: &Sequence, axes: Vec<Axis>, size: Size) -> Result<Row> {
+fn run(pose: Origin, gpu: &GpuContext, sequence: &SimulatedSequence, axes: Vec<Axis>, size: Size) -> Result<Row> {
     let mut session = session(pose, gpu, sequence, size)?;
     let (mut set_ms, mut pose_ms, mut view_ms, mut count) = (0.0, 0.0, 0.0, 0.0);
     let mut sheet = ScoreSheet::default();
@@ -186,12 +192,12 @@ fn run(pose: Origin, gpu: &GpuContext, sequence: &Sequence, axes: Vec<Axis>, siz
 }
 
 impl Row {
-    /// Milliseconds of a set with one view drawn.
+    /// Returns the milliseconds per frame set with one rendered view.
     fn all_ms(&self) -> f64 {
         self.pose_ms + self.rest_ms + self.view_ms
     }
 
-    /// How much there is along an axis.
+    /// Returns the value along an axis.
     fn amount(&self, axis: Axis) -> f64 {
         match axis {
             Axis::Pixels => f64::from(self.size.side).powi(2),
@@ -240,7 +246,7 @@ fn table(rows: &[Row]) -> String {
     text
 }
 
-/// Run time over each quantity, as multiples of the first row's.
+/// Plots run time over each quantity relative to that of the first row.
 fn plot(rows: &[Row]) -> Plot {
     let base = rows.first();
     let of = |axis: Axis, name: &str| {

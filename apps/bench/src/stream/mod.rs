@@ -16,11 +16,11 @@ use flyrig_report::{progress_bar, stop, write_whole};
 use flyrig_viewer::Scene;
 
 use arguments::BenchStreamArgs;
-use atlas::Atlas;
-use forms::{AvatarPoses, Form, Packed, Spz, Stream};
-use score::Tally;
-use table::Row;
-use take::Take;
+use atlas::VideoAtlas;
+use forms::{AvatarPoses, Form, Packed, Spz, StreamForm};
+use score::FormTally;
+use table::FormRow;
+use take::CodedTake;
 
 /// Runs the command.
 pub fn stream(args: &BenchStreamArgs, gpu: &GpuContext) -> Result<()> {
@@ -36,7 +36,7 @@ pub fn stream(args: &BenchStreamArgs, gpu: &GpuContext) -> Result<()> {
                 if stop::requested() {
                     break;
                 }
-                let take = Take::record(args, gpu, &folder, pose, gaussians)?;
+                let take = CodedTake::record(args, gpu, &folder, pose, gaussians)?;
                 rows.extend(run(args, gpu, &take, has_codec)?);
                 write(args, &rows)?;
             }
@@ -47,7 +47,7 @@ pub fn stream(args: &BenchStreamArgs, gpu: &GpuContext) -> Result<()> {
     Ok(())
 }
 
-fn write(args: &BenchStreamArgs, rows: &[Row]) -> Result<()> {
+fn write(args: &BenchStreamArgs, rows: &[FormRow]) -> Result<()> {
     let text = table::table(rows) + &table::exponents(rows);
     write_whole(&args.output.out.join("stream.md"), text.as_bytes())?;
     write_whole(&args.output.out.join("stream.csv"), table::csv(rows).as_bytes())?;
@@ -57,10 +57,10 @@ fn write(args: &BenchStreamArgs, rows: &[Row]) -> Result<()> {
 }
 
 /// Codes and scores a take in every form.
-fn run(args: &BenchStreamArgs, gpu: &GpuContext, take: &Take, has_codec: bool) -> Result<Vec<Row>> {
+fn run(args: &BenchStreamArgs, gpu: &GpuContext, take: &CodedTake, has_codec: bool) -> Result<Vec<FormRow>> {
     let mut forms: Vec<Box<dyn Form>> = Vec::new();
     for &step in &args.steps {
-        forms.push(Box::new(Stream::new(step)));
+        forms.push(Box::new(StreamForm::new(step)));
     }
     if let Some(avatar) = &take.avatar {
         forms.push(Box::new(AvatarPoses::new(avatar)));
@@ -68,14 +68,14 @@ fn run(args: &BenchStreamArgs, gpu: &GpuContext, take: &Take, has_codec: bool) -
     forms.push(Box::new(Packed));
     forms.push(Box::new(Spz));
     for &crf in args.crf.iter().filter(|_| has_codec) {
-        forms.push(Box::new(Atlas::new(crf, take)?));
+        forms.push(Box::new(VideoAtlas::new(crf, take)?));
     }
     let mut scene = Scene::new(&gpu.fastest())?;
     let bar = progress_bar((forms.len() * take.kept.len()) as u64, "bench stream");
     let mut rows = Vec::new();
     for form in &mut forms {
         bar.set_message(format!("{}: {}", take.name, form.name()));
-        let mut tally = Tally::new(take.cameras.len());
+        let mut tally = FormTally::new(take.cameras.len());
         for (at, kept) in take.kept.iter().enumerate() {
             bar.inc(1);
             let coded = form.code(at, kept)?;

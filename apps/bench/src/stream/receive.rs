@@ -1,5 +1,4 @@
-//! `flyrig-bench receive`: receives the people of a rig or of a take that `flyrig play --repeat` publishes, and measures rates, age and
-//! errors of views.
+//! `flyrig-bench receive`: rates, age and errors of the received people of a rig, or of a take that `flyrig play --repeat` publishes.
 
 use std::{
     collections::BTreeMap,
@@ -31,22 +30,22 @@ use std::path::PathBuf;
 /// Arguments of the command.
 #[derive(Debug, Args)]
 pub struct BenchReceiveArgs {
-    /// The recording that is played (`flyrig watch --record`): views are compared with those of nothing lost. Without one every motion is
-    /// drawn as it comes, and its age then is measured as well.
+    /// The played recording (`flyrig watch --record`): views are compared with those of a lossless reception. Without it every motion is
+    /// rendered on arrival, and its age after that is measured as well.
     pub take: Option<PathBuf>,
-    /// Key to the rig.
+    /// Key file for the rig.
     #[arg(long, conflicts_with_all = ["rig", "connect"])]
     pub key: Option<PathBuf>,
     /// Name of the rig.
     #[arg(long, default_value = "flyrig")]
     pub rig: String,
-    /// zenoh endpoint of `flyrig play`.
+    /// Address of `flyrig play` (zenoh endpoint).
     #[arg(long, default_value = "tcp/127.0.0.1:7447")]
     pub connect: String,
-    /// Seconds from the start to the end.
+    /// Duration, seconds.
     #[arg(long, default_value_t = 30.0, value_parser = parse_seconds)]
     pub seconds: f64,
-    /// Name of the line in the results.
+    /// Name of the network line in the results.
     #[arg(long, default_value = "loopback")]
     pub label: String,
     /// File of the results (JSON).
@@ -54,18 +53,18 @@ pub struct BenchReceiveArgs {
     pub out: Option<PathBuf>,
 }
 
-/// Topic of `flyrig watch --record`, and its kinds of messages.
+/// Topic of `flyrig watch --record`, and its message kinds.
 const TOPIC: &str = "person-stream";
 const MOTION: u8 = 255;
 const TEMPLATE: u8 = 254;
-/// Time after a person is there that does not count.
+/// Time after the arrival of a person that is not measured.
 const SETTLING: Duration = Duration::from_secs(2);
-/// How often what is displayed is compared.
+/// Interval of comparisons of the displayed view.
 const COMPARE_EVERY: Duration = Duration::from_secs(1);
-/// How often the age of what is displayed is looked at.
+/// Interval of samples of the displayed motion's age.
 const LOOK_EVERY: Duration = Duration::from_millis(10);
 
-/// Of the take's frames every so many are kept to compare with: a frame's colours take 2 MB.
+/// Interval of the take's frames that are kept for comparison: the colours of a frame take 2 MB.
 const KEPT_EVERY: u64 = 8;
 
 type Colors = Arc<Vec<[f32; 4]>>;
@@ -74,29 +73,29 @@ type Colors = Arc<Vec<[f32; 4]>>;
 #[derive(Debug, Default, Serialize)]
 struct Row {
     line: String,
-    /// From the start to the first message, to a person, and to all colours, seconds.
+    /// Seconds from the start to the first message, to a person, and to complete colours.
     message_after_secs: Option<f64>,
     motion_after_secs: Option<f64>,
     complete_after_secs: Option<f64>,
-    /// Of the time from [`SETTLING`] after the person was there.
+    /// Rates from [`SETTLING`] after the arrival of the person on.
     motions_per_second: f64,
     colors_per_second: f64,
     kilobytes_per_second: f64,
-    /// Age of the newest motion, over all instants, milliseconds.
+    /// Age of the newest motion over all samples, milliseconds.
     age_p50_ms: f64,
     age_p99_ms: f64,
-    /// Age of motions when they were drawn and read back, milliseconds; without a take to compare with.
+    /// Age of motions after rendering and reading back, milliseconds; only without a take to compare with.
     drawn_p50_ms: Option<f64>,
     drawn_p99_ms: Option<f64>,
-    /// Layers of colours, a mean over all instants.
+    /// Mean number of colour layers over all samples.
     color_layers: f64,
     longest_gap_secs: f64,
-    /// Views of what is displayed against views of the same frame received without a line.
+    /// PSNR of displayed views against those of the same frame received without loss, decibels.
     mean_db: Option<f64>,
     worst_db: Option<f64>,
 }
 
-/// A view to draw.
+/// A view to render.
 struct Job {
     posed: Posed,
     colors: Colors,
@@ -105,9 +104,9 @@ struct Job {
 }
 
 enum Wanted {
-    /// Decibels to a view of these colours.
+    /// PSNR against a view with these colours.
     Comparison(Colors),
-    /// The age of this capture time when it is drawn, by a clock that is so many nanoseconds behind ours.
+    /// Age of this capture time (nanoseconds) after rendering, and the offset of its clock, nanoseconds.
     Age(i64, Option<i64>),
 }
 
@@ -117,7 +116,7 @@ struct Results {
     ages_ms: Vec<f64>,
 }
 
-/// Draws what comes.
+/// Renders the jobs until their sender is dropped.
 fn draw(gpu: &GpuContext, jobs: Receiver<Job>) -> Result<Results> {
     let mut scene = Scene::new(gpu)?;
     let mut results = Results::default();
@@ -137,7 +136,7 @@ fn draw(gpu: &GpuContext, jobs: Receiver<Job>) -> Result<Results> {
     Ok(results)
 }
 
-/// Colours after the frames that are kept, for somebody who misses nothing.
+/// Returns the colours after the kept frames, for a lossless reception.
 fn reference(take: &Path) -> Result<BTreeMap<u64, Colors>> {
     let mut people = People::default();
     let mut known = BTreeMap::new();
@@ -360,7 +359,7 @@ fn ranks(mut values: Vec<f64>) -> [Option<f64>; 2] {
         .map(|share| values.get(((values.len() as f64 * share) as usize).min(values.len().saturating_sub(1))).copied())
 }
 
-/// Decibels within the person's box; None where nobody is seen or nothing differs.
+/// Returns the PSNR within the person's box, decibels; `None` where no person is visible.
 fn compare(ours: &RenderedView, wanted: &RenderedView) -> Result<Option<f64>> {
     let (width, height) = (wanted.width, wanted.height);
     let mask = Mask::new(width, height, wanted.rgba.chunks_exact(4).map(|p| p[3]).collect())?;

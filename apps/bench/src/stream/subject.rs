@@ -10,14 +10,14 @@ pub const SIMULATED: &str = "sim:";
 
 /// A data set to code.
 #[derive(Debug, Clone)]
-pub enum Subject {
+pub enum CodedSubject {
     /// A folder in EasyMocap layout.
     Folder(PathBuf),
     /// A simulated person with this motion.
     Simulated(MotionKind, String),
 }
 
-impl std::str::FromStr for Subject {
+impl std::str::FromStr for CodedSubject {
     type Err = String;
 
     fn from_str(text: &str) -> Result<Self, String> {

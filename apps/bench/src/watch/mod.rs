@@ -1,5 +1,5 @@
-//! `flyrig-bench watch`: how soon a bumped camera is found among switched lights, passers-by and exposure jumps, how well the bump is
-//! measured, at which cost, and how often nothing is taken for a bump.
+//! `flyrig-bench watch`: detection of bumped cameras among switched lights, passers-by and exposure jumps: delay, error of the measured
+//! bump, false alarms and run time.
 
 use std::time::Instant;
 
@@ -42,9 +42,9 @@ pub struct BenchWatchArgs {
     pub seed: u64,
 }
 
-/// Time between looks, seconds.
+/// Time between checks, seconds.
 const EVERY_SECS: f64 = 1.0;
-/// Looks before a bump, and after it at most.
+/// Checks before a bump, and largest number after it.
 const BEFORE: u64 = 6;
 const AFTER: u64 = 20;
 /// Mean times between switches of a lamp and between exposure jumps, seconds.
@@ -193,7 +193,7 @@ fn median_and_worst(values: &mut [f64]) -> (f64, f64) {
     (values.get(values.len() / 2).copied().unwrap_or(f64::NAN), values.last().copied().unwrap_or(f64::NAN))
 }
 
-/// Mean distance between the images of points in the volume that people fill, pixels.
+/// Returns the mean distance between the projections of points in the volume that people fill, pixels.
 fn apart_px(camera: &Camera, other: &Camera) -> f64 {
     let heights = [0.1, 0.6, 1.1, 1.6];
     let places = [-0.4, 0.0, 0.4];
@@ -263,7 +263,7 @@ impl Room {
         Ok(self.simulator.capture_with(&Shot { exposure, camera_shift, ..Shot::new(nanos, slot) })?.0)
     }
 
-    /// Watches every camera, its first image being the reference.
+    /// Creates a watch for every camera, with its first image as the reference.
     fn watches(&mut self) -> Result<Vec<CameraWatch>> {
         (0..self.exposures.len())
             .map(|slot| {

@@ -6,9 +6,7 @@ use std::{
 };
 
 use anyhow::{Context as _, Result, ensure};
-use flyrig_avatar::{
-    AtlasLayout, Avatar, AvatarScene, Bones, Card, Drawn, ErrorWeights, Fit, FitSettings, LocalSettings,
-};
+use flyrig_avatar::{Avatar, AvatarScene, Bones, Card, Drawn, Fit, FitSettings, LocalSettings};
 use flyrig_fusion::BodySettings;
 use flyrig_gpu::GpuContext;
 use flyrig_renderer::HarmonicOrder;

@@ -20,31 +20,32 @@ pub struct CalibrateBoardArgs {
     /// Side of a square, millimetres.
     #[arg(long, default_value_t = 30.0)]
     pub square_mm: f64,
+    /// Pattern of the board.
     #[arg(long, value_enum, default_value = "charuco")]
     pub pattern: PatternName,
-    /// Dictionary of the markers, as OpenCV names it.
+    /// Dictionary of the markers, by its name in OpenCV.
     #[arg(long, default_value = "DICT_5X5_100")]
     pub dictionary: String,
-    /// Side of a marker as a share of the square's.
+    /// Side of a marker as a fraction of that of a square.
     #[arg(long, default_value_t = 0.75)]
     pub marker: f64,
-    /// Paper; a sheet of the board's own size otherwise.
+    /// Paper size; a sheet of the size of the board otherwise.
     #[arg(long, value_enum)]
     pub paper: Option<Paper>,
     #[command(flatten)]
     pub target: TargetArgs,
 }
 
-/// Patterns of boards.
+/// Pattern of a board.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, ValueEnum)]
 pub enum PatternName {
-    /// Squares with markers: any part of the board is recognised.
+    /// Squares with markers: any part of the board is recognized.
     Charuco,
-    /// Squares alone: the whole board must be in the image.
+    /// Squares alone: the whole board must be visible.
     Chessboard,
 }
 
-/// Sizes of paper.
+/// Size of paper.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, ValueEnum)]
 pub enum Paper {
     A4,
@@ -55,7 +56,7 @@ pub enum Paper {
 }
 
 impl Paper {
-    /// Long and short side, millimetres.
+    /// Returns the long and the short side, millimetres.
     pub fn size_mm(self) -> [f64; 2] {
         match self {
             Self::A4 => [297.0, 210.0],

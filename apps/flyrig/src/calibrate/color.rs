@@ -21,7 +21,7 @@ use clap::Args;
 #[derive(Debug, Args)]
 #[command(mut_arg("secs", |arg| arg.default_value("10")))]
 pub struct CalibrateColorArgs {
-    /// People who are followed at most.
+    /// Largest number of tracked people.
     #[arg(long, default_value_t = 1)]
     pub people: usize,
     #[command(flatten)]

@@ -12,19 +12,19 @@ use std::path::PathBuf;
 
 #[derive(Debug, Args)]
 pub struct CalibrateConvertArgs {
-    /// A file or folder of the other program; see --from.
+    /// File or folder of the other program; see --from.
     pub input: PathBuf,
-    /// Format of the input, recognised by its names otherwise: flyrig, easymocap, opencv, kalibr, colmap, nerfstudio, qualisys,
+    /// Format of the input, recognized by file names otherwise: flyrig, easymocap, opencv, kalibr, colmap, nerfstudio, qualisys,
     /// anipose (Pose2Sim and caliscope too), mrcal.
     #[arg(long, value_parser = parse_format)]
     pub from: Option<Format>,
-    /// Format of the output, one of the same.
+    /// Format of the output, one of those of --from.
     #[arg(long, value_parser = parse_format, default_value = "flyrig")]
     pub to: Format,
-    /// Metres of a unit of length in the input: 0.001 for millimetres; for COLMAP and nerfstudio, whose unit is arbitrary, its length in the room.
+    /// Length of the unit of the input, metres: 0.001 for millimetres; the measured length for COLMAP and nerfstudio, whose unit is arbitrary.
     #[arg(long, default_value_t = 1.0, value_parser = parse_scale)]
     pub scale: f64,
-    /// Folder with images/CAM, for formats that do not say how large the images are; the input otherwise.
+    /// Folder with images/CAM, for formats without the size of the images; the input otherwise.
     #[arg(long)]
     pub images: Option<PathBuf>,
     #[command(flatten)]

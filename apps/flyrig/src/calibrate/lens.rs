@@ -6,7 +6,10 @@ use flyrig_gpu::GpuContext;
 use flyrig_report::stop;
 use flyrig_types::{CameraId, Intrinsics};
 
-use super::{refuse_existing, views::Seen};
+use super::{
+    refuse_existing,
+    views::{Seen, TakeArgs},
+};
 use crate::arguments::{BoardArgs, TargetArgs};
 use clap::Args;
 

@@ -31,10 +31,10 @@ use clap::Args;
 #[derive(Debug, Args)]
 #[command(mut_arg("secs", |arg| arg.default_value("1800")))]
 pub struct CalibrateLiveArgs {
-    /// Ends once every camera is known to this in the middle of the boards, millimetres (one standard deviation).
+    /// Precision at which the calibration ends: standard deviation of every camera in the middle of the boards, millimetres.
     #[arg(long, default_value_t = 1.0, value_parser = parse_target_mm)]
     pub target_mm: f64,
-    /// Address of the page; other computers and telephones reach it at 0.0.0.0:8090.
+    /// Address of the page; 0.0.0.0:8090 makes it reachable for other computers and phones.
     #[arg(long, default_value = "127.0.0.1:8090")]
     pub listen: String,
     #[command(flatten)]

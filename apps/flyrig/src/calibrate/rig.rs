@@ -10,7 +10,10 @@ use flyrig_types::Intrinsics;
 use glam::DVec3;
 use serde_json::json;
 
-use super::{FILES, lens, page, refuse_existing, views::Seen};
+use super::{
+    FILES, lens, page, refuse_existing,
+    views::{Seen, TakeArgs},
+};
 use crate::arguments::{BoardArgs, SolveArgs, TargetArgs};
 use clap::Args;
 
@@ -18,7 +21,7 @@ use clap::Args;
 pub struct CalibrateRigArgs {
     #[command(flatten)]
     pub take: TakeArgs,
-    /// Solve for the lenses together with the poses.
+    /// Optimize the lenses together with the poses.
     #[arg(long)]
     pub refine_lenses: bool,
     #[command(flatten)]

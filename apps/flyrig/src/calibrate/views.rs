@@ -23,10 +23,10 @@ use flyrig_report::arguments::parse_seconds;
 
 #[derive(Debug, Args)]
 pub struct TakeArgs {
-    /// Seconds that are looked at.
+    /// Seconds of the input that are used.
     #[arg(long, default_value_t = 120.0, value_parser = parse_seconds)]
     pub secs: f64,
-    /// Time from one set that is looked at to the next, milliseconds.
+    /// Time between used frame sets, milliseconds.
     #[arg(long, default_value_t = 100.0, value_parser = parse_most_ms)]
     pub every_ms: f64,
     #[command(flatten)]
