@@ -8,19 +8,17 @@ mod export;
 mod parts;
 mod render;
 
-use std::path::Path;
+use std::path::{Path, PathBuf};
 
 use anyhow::Result;
+use clap::Subcommand;
 use flyrig_avatar::Avatar;
 use flyrig_body::Template;
 use flyrig_fusion::{AppearanceOptions, BodySettings, BudgetSettings, SessionSettings};
 use flyrig_gpu::GpuContext;
 use flyrig_report::{Replay, ReplaySettings};
 
-use crate::arguments::DatasetArgs;
-use crate::recording;
-use clap::Subcommand;
-use std::path::PathBuf;
+use crate::{arguments::DatasetArgs, recording};
 
 /// Subcommands of `flyrig avatar`.
 #[derive(Debug, Subcommand)]

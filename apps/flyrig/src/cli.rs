@@ -51,6 +51,7 @@ pub struct Cli {
     pub command: Command,
 }
 
+/// Subcommands of `flyrig`.
 #[derive(Debug, Subcommand)]
 pub enum Command {
     /// Run the simulated rig with a separate viewer process and write a report.
@@ -128,6 +129,7 @@ pub enum Command {
     },
 }
 
+/// Subcommands of `flyrig config`.
 #[derive(Debug, Subcommand)]
 pub enum ConfigAction {
     /// Print the default configuration with a comment on every key.

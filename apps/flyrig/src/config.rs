@@ -79,6 +79,7 @@ pub enum WatchMode {
     Correct,
 }
 
+/// The table `[rig]`.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields, default)]
 pub struct RigSection {
@@ -104,7 +105,7 @@ pub enum SourceKind {
 }
 
 impl SourceKind {
-    /// Whether frames arrive at their capture times, with the clock of this computer.
+    /// Whether frames come when they are taken, with the time of this computer.
     pub fn is_live(self) -> bool {
         matches!(self, Self::Cameras | Self::Network)
     }
@@ -122,18 +123,18 @@ pub struct SourceSection {
 }
 
 impl SourceSection {
-    /// Returns the names of the chosen cameras; empty for all.
+    /// Names of the chosen cameras; none for all.
     pub fn names(&self) -> Vec<String> {
         self.cameras.iter().map(|entry| entry.name().to_owned()).collect()
     }
 
-    /// Returns the folder of the calibration; `None` where the recording contains it.
+    /// Folder of the calibration; `None` where the recording holds it.
     pub fn calibration_folder(&self) -> Option<&Path> {
         let named = Some(self.calibration.as_path()).filter(|folder| !folder.as_os_str().is_empty());
         named.or((self.kind != SourceKind::Mcap).then_some(self.path.as_path()))
     }
 
-    /// Whether a calibration is named or exists in the folder, even a damaged one.
+    /// Whether a calibration is named or lies in the folder. One that is damaged is there, too.
     pub fn has_calibration(&self) -> bool {
         let holds = |folder: &Path| {
             ["calibration.toml", "intri.yml", "extri.yml"].iter().any(|file| folder.join(file).exists())
@@ -214,12 +215,14 @@ impl Default for RecordSection {
     }
 }
 
+/// The table `[gpu]`.
 #[derive(Debug, Clone, PartialEq, Default, Serialize, Deserialize)]
 #[serde(deny_unknown_fields, default)]
 pub struct GpuSection {
     pub adapter: String,
 }
 
+/// The table `[health]`.
 #[derive(Debug, Clone, PartialEq, Default, Serialize, Deserialize)]
 #[serde(deny_unknown_fields, default)]
 pub struct HealthSection {

@@ -1,23 +1,29 @@
 //! `flyrig demo`: the whole system on a simulated rig, with a viewer in a process of its own and a report.
 
 use std::{
-    path::Path,
+    net::SocketAddr,
+    path::{Path, PathBuf},
     process::{Child, Command},
     sync::{Arc, Mutex, MutexGuard},
     time::{Duration, Instant},
 };
 
 use anyhow::{Context, Result, anyhow, bail, ensure};
+use clap::Args;
 use flyrig_body::{ShapeParams, default_template};
 use flyrig_capture::{CameraSource, Pacing};
 use flyrig_fusion::{
-    AppearanceMode, AppearanceOptions, BodySettings, EstimatedPerception, GivenPerception, InputFormat, Intake,
-    LivePublisher, LiveRig, LiveViews, Origin, OutputSettings, SHAPE_SECS, SHAPE_SETS, Session, SessionBuilder,
-    SessionSettings, StageSummary, resident_mib,
+    AppearanceMode, AppearanceOptions, BodySettings, BudgetSettings, EstimatedPerception, GivenPerception, InputFormat,
+    Intake, LivePublisher, LiveRig, LiveViews, Origin, OutputSettings, PerceptionSettings, SHAPE_SECS, SHAPE_SETS,
+    Session, SessionBuilder, SessionSettings, StageSummary, TrackingSettings, resident_mib,
 };
 use flyrig_gpu::GpuContext;
 use flyrig_metrics::{CameraScore, ScoreSheet, score_view};
-use flyrig_report::{ContactRow, Curve, Report, contact_images, dataset, png, progress_bar, stop, write_whole};
+use flyrig_report::{
+    ContactRow, Curve, Report,
+    arguments::{GaussiansArgs, OutputArgs, parse_minutes},
+    contact_images, dataset, png, progress_bar, stop, write_whole,
+};
 use flyrig_sim::{FaultScript, MotionConfig, MotionKind, SimConfig, SimFrame, SimTime, Simulator};
 use flyrig_sync::SyncSettings;
 use flyrig_transport::{Publisher, TransportConfig};
@@ -26,14 +32,8 @@ use indicatif::ProgressBar;
 use serde::{Deserialize as _, Serialize, de::IntoDeserializer as _};
 
 use crate::{source::simulated_plates, watch::WatchStats};
-use clap::Args;
-use flyrig_fusion::BudgetSettings;
-use flyrig_fusion::PerceptionSettings;
-use flyrig_fusion::TrackingSettings;
-use flyrig_report::arguments::{GaussiansArgs, OutputArgs, parse_minutes};
-use std::net::SocketAddr;
-use std::path::PathBuf;
 
+/// Arguments of `flyrig demo`.
 #[derive(Debug, Args)]
 #[command(mut_arg("out", |arg| arg.default_value("out/demo")))]
 pub struct DemoArgs {

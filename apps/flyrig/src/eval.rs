@@ -1,11 +1,13 @@
 //! `flyrig eval`: replay a data set in order, as live, render the cameras that were held out, score them.
 
-use std::time::Instant;
+use std::{path::PathBuf, time::Instant};
 
 use anyhow::{Context, Result, ensure};
+use clap::Args;
 use flyrig_body::write_mesh_ply;
 use flyrig_fusion::{
-    AppearanceMode, BodySettings, Counts, Origin, Outcome, PersonId, SessionSettings, Solver, StageSummary,
+    AppearanceMode, AppearanceOptions, BodySettings, BudgetSettings, Counts, Origin, Outcome, PersonId,
+    SessionSettings, Solver, StageSummary,
 };
 use flyrig_gpu::GpuContext;
 use flyrig_metrics::{CameraScore, FrameScore, ScoreSheet, error_parts, score_view};
@@ -17,13 +19,12 @@ use flyrig_types::{Camera, Frame, RenderedView};
 use rayon::prelude::*;
 use serde::Serialize;
 
-use crate::arguments::{DatasetArgs, HoldoutArgs};
-use crate::recording;
-use clap::Args;
-use flyrig_fusion::AppearanceOptions;
-use flyrig_fusion::BudgetSettings;
-use std::path::PathBuf;
+use crate::{
+    arguments::{DatasetArgs, HoldoutArgs},
+    recording,
+};
 
+/// Arguments of `flyrig eval`.
 #[derive(Debug, Args)]
 pub struct EvalArgs {
     #[command(flatten)]

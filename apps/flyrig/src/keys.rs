@@ -4,9 +4,9 @@ use std::path::{Path, PathBuf};
 
 use anyhow::{Context as _, Result};
 use clap::{Args, Subcommand};
-use flyrig_access::DEFAULT_PORT;
-use flyrig_access::{Holder, KeyFile, Ring, Role};
+use flyrig_access::{DEFAULT_PORT, Holder, KeyFile, Ring, Role};
 
+/// Keys of a rig.
 #[derive(Debug, Args)]
 pub struct RingArgs {
     /// Folder of the rig's keys; the only such folder in the current one otherwise.

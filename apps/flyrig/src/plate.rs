@@ -6,17 +6,22 @@ use std::{
 };
 
 use anyhow::{Context as _, Result, bail, ensure};
+use clap::Args;
 use flyrig_capture::{CaptureThreads, Pacing, PopError, SourceOpener, ThreadsConfig, to_rgb8};
 use flyrig_gpu::GpuContext;
-use flyrig_report::{dataset, png, progress_bar, stop, write_whole};
+use flyrig_report::{
+    arguments::{FpsArgs, parse_seconds},
+    dataset, png, progress_bar, stop, write_whole,
+};
 use flyrig_tracker::{PoseNet, shows_person};
 use flyrig_types::{CameraId, Frame, Image, PixelFormat};
 
-use crate::arguments::TargetArgs;
-use crate::take::{self, Take};
-use clap::Args;
-use flyrig_report::arguments::{FpsArgs, parse_seconds};
+use crate::{
+    arguments::TargetArgs,
+    take::{self, Take},
+};
 
+/// Arguments of `flyrig plate`.
 #[derive(Debug, Args)]
 pub struct PlateArgs {
     /// A configuration (*.toml), a recording (*.mcap) or a folder with images/CAM.

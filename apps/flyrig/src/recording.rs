@@ -2,11 +2,12 @@
 
 use std::{
     fs,
-    path::Path,
+    path::{Path, PathBuf},
     time::{Duration, Instant},
 };
 
 use anyhow::{Context as _, Result, bail, ensure};
+use clap::Args;
 use flyrig_calib::{calibration_toml, parse_calibration, save_export};
 use flyrig_capture::{
     CameraSource, CaptureThreads, Compression, McapReplay, Note, Pacing, PopError, Recorded, Recorder, RecorderConfig,
@@ -23,15 +24,14 @@ use foxglove::{
     messages::{CameraCalibration, FrameTransforms, Log},
 };
 
-use crate::arguments::{LagArgs, StopArgs};
 use crate::{
+    arguments::{LagArgs, StopArgs},
     config::{Config, RecordSection, SourceKind},
     live, pose_recording,
     source::{self, Source},
 };
-use clap::Args;
-use std::path::PathBuf;
 
+/// Arguments of `flyrig record`.
 #[derive(Debug, Args)]
 pub struct RecordArgs {
     /// Configuration (TOML); see `flyrig config print`.
@@ -43,6 +43,7 @@ pub struct RecordArgs {
     pub stop: StopArgs,
 }
 
+/// Arguments of `flyrig replay`.
 #[derive(Debug, Args)]
 pub struct ReplayArgs {
     /// The MCAP file.

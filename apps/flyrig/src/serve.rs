@@ -2,18 +2,20 @@
 
 use std::{
     net::{Ipv4Addr, TcpListener},
+    path::PathBuf,
     time::Duration,
 };
 
-use crate::arguments::RigArgs;
 use anyhow::{Context as _, Result};
 use clap::Args;
 use flyrig_fusion::check_threads;
 use flyrig_report::stop;
 use flyrig_transport::{Relay, TransportConfig};
 use flyrig_web::{WebConfig, WebServer};
-use std::path::PathBuf;
 
+use crate::arguments::RigArgs;
+
+/// Arguments of `flyrig serve`.
 #[derive(Debug, Args)]
 pub struct ServeArgs {
     #[command(flatten)]

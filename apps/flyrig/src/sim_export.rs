@@ -1,14 +1,14 @@
 //! `flyrig sim export`: a simulated capture as a data set.
 
-use std::time::Instant;
+use std::{path::PathBuf, time::Instant};
 
 use anyhow::Result;
 use clap::{Args, Subcommand};
 use flyrig_gpu::GpuContext;
 use flyrig_report::{progress_bar, stop};
 use flyrig_sim::{ExportOptions, SimConfig, Simulator, export};
-use std::path::PathBuf;
 
+/// Arguments of `flyrig sim export`.
 #[derive(Debug, Args)]
 pub struct SimExportArgs {
     /// Configuration of the simulated rig (TOML), as `flyrig sim print` prints it; its defaults otherwise.

@@ -6,22 +6,20 @@
 
 use std::{
     collections::BTreeSet,
-    path::Path,
+    path::{Path, PathBuf},
     time::{Duration, Instant},
 };
 
 use anyhow::{Context as _, Result, ensure};
+use clap::Args;
 use flyrig_capture::{MessageTap, Pacing, monotonic_nanos, recorded_messages};
-use flyrig_report::stop;
+use flyrig_report::{arguments::parse_speed, stop};
 use flyrig_stream::{Stamp, restamp, stamp_of, template_hash};
 use flyrig_transport::{Interests, PersonMessage, Publisher, Subscriber, TransportConfig};
 
-use crate::watch::WatchArgs;
-use crate::{config::RecordSection, recording};
-use clap::Args;
-use flyrig_report::arguments::parse_speed;
-use std::path::PathBuf;
+use crate::{config::RecordSection, recording, watch::WatchArgs};
 
+/// Arguments of `flyrig play`.
 #[derive(Debug, Args)]
 pub struct PlayArgs {
     /// Recording of `flyrig watch --record`.

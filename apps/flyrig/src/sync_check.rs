@@ -3,6 +3,7 @@
 use std::time::{Duration, Instant};
 
 use anyhow::{Result, bail, ensure};
+use clap::Args;
 use flyrig_capture::{CaptureThreads, Pacing, PopError, SourceOpener, ThreadsConfig, to_rgb8_into};
 use flyrig_gpu::GpuContext;
 use flyrig_report::stop;
@@ -11,14 +12,13 @@ use flyrig_sync::{
 };
 use flyrig_types::{CameraId, Image, Rig};
 
-use crate::arguments::parse_most_ms;
-use crate::arguments::{CalibrationArgs, InputArgs, SpanArgs};
 use crate::{
+    arguments::{CalibrationArgs, InputArgs, SpanArgs, parse_most_ms},
     silhouettes::Silhouettes,
     take::{self, CalibratedTake},
 };
-use clap::Args;
 
+/// Arguments of `flyrig sync-check`.
 #[derive(Debug, Args)]
 #[command(mut_arg("secs", |arg| arg.alias("seconds")))]
 pub struct SyncCheckArgs {

@@ -1,14 +1,16 @@
 //! `flyrig view`: a window in which one walks around the people of a running rig.
 
-use crate::arguments::{RigArgs, StopArgs};
+use std::path::PathBuf;
+
 use anyhow::Result;
 use clap::Args;
 use flyrig_gpu::GpuContext;
-use flyrig_report::arguments::parse_size;
-use flyrig_report::{png, write_whole};
+use flyrig_report::{arguments::parse_size, png, write_whole};
 use flyrig_viewer::{ViewOptions, open_window};
-use std::path::PathBuf;
 
+use crate::arguments::{RigArgs, StopArgs};
+
+/// Arguments of `flyrig view`.
 #[derive(Debug, Args)]
 pub struct ViewArgs {
     #[command(flatten)]

@@ -7,11 +7,9 @@ use std::{
     time::{Duration, Instant},
 };
 
-use crate::arguments::{RigArgs, StopArgs};
 use anyhow::{Context, Result, bail, ensure};
 use clap::Args;
-use flyrig_report::arguments::parse_size;
-use flyrig_report::{png, stop, write_whole};
+use flyrig_report::{arguments::parse_size, png, stop, write_whole};
 use flyrig_transport::{
     ImageFormat, Interests, Received, Subscriber, TransportConfig, TransportError, TransportErrorKind, ViewFrame,
     ViewpointStatus, Views, printable,
@@ -24,6 +22,9 @@ use opencv::{
 };
 use serde::{Deserialize, Serialize};
 
+use crate::arguments::{RigArgs, StopArgs};
+
+/// Arguments of `flyrig watch`.
 #[derive(Debug, Args)]
 pub struct WatchArgs {
     #[command(flatten)]

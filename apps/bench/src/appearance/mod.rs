@@ -5,13 +5,8 @@ use std::{
     path::{Path, PathBuf},
 };
 
-use crate::harness::{
-    arguments::SimulationArgs,
-    sequence::{SequenceConfig, SequenceMotion, SimulatedSequence},
-};
 use anyhow::{Context, Result};
-use clap::ValueEnum as _;
-use clap::{Args, builder::TypedValueParser as _};
+use clap::{Args, ValueEnum as _, builder::TypedValueParser as _};
 use flyrig_fusion::{
     AppearanceMode, AppearanceOptions, BodySettings, GivenPerception, NetworksOn, PersonId, SessionBuilder,
     SessionSettings,
@@ -19,13 +14,18 @@ use flyrig_fusion::{
 use flyrig_gpu::GpuContext;
 use flyrig_metrics::{ScoreSheet, score_view};
 use flyrig_renderer::srgb_from_linear;
-use flyrig_report::arguments::{GaussiansArgs, OutputArgs};
 use flyrig_report::{
+    arguments::{GaussiansArgs, OutputArgs},
     plot::{Line, Plot, Series},
     progress_bar, write_whole,
 };
 use flyrig_stfa::EMBEDDED;
 use serde::Serialize;
+
+use crate::harness::{
+    arguments::SimulationArgs,
+    sequence::{SequenceConfig, SequenceMotion, SimulatedSequence},
+};
 
 /// Arguments of the command.
 #[derive(Debug, Args)]

@@ -7,30 +7,31 @@ mod variant;
 use std::{
     fmt::Write as _,
     ops::Range,
+    path::PathBuf,
     time::{Duration, Instant},
 };
 
-use crate::harness::{arguments::RecordedArgs, images::copy, statistics::exponent};
 use anyhow::{Context, Result};
 use clap::{Args, builder::TypedValueParser as _};
-use detail::{SmallViews, small_views};
 use flyrig_avatar::{Avatar, AvatarScene, Bones, Fit, FitSettings};
 use flyrig_body::DEFAULT_GAUSSIAN_COUNT;
-use flyrig_fusion::Origin;
-use flyrig_fusion::{BudgetSettings, Outcome, PersonId, Solver, resident_mib};
+use flyrig_fusion::{BudgetSettings, Origin, Outcome, PersonId, Solver, resident_mib};
 use flyrig_gpu::GpuContext;
 use flyrig_metrics::{CameraScore, ScoreSheet, score_view};
 use flyrig_renderer::HarmonicOrder;
-use flyrig_report::arguments::{OutputArgs, parse_range, parse_seconds};
 use flyrig_report::{
-    AvatarTake, Replay, ReplaySettings, frame_number,
+    AvatarTake, Replay, ReplaySettings,
+    arguments::{OutputArgs, parse_range, parse_seconds},
+    frame_number,
     plot::{Line, Plot, Series},
     progress_bar, stop, write_whole,
 };
 use flyrig_types::{Camera, FrameSet, Image, Mask, Pose, RenderedView};
 use glam::DVec3;
 use serde::Serialize;
-use std::path::PathBuf;
+
+use crate::harness::{arguments::RecordedArgs, images::copy, statistics::exponent};
+use detail::{SmallViews, small_views};
 use variant::Variant;
 
 /// Arguments of the command.
@@ -130,18 +131,16 @@ pub fn avatar(args: &BenchAvatarArgs, gpu: &GpuContext) -> Result<()> {
         if stop::requested() {
             break;
         }
-        let training = settings(gaussians, &fitted);
+        let (take, held, cameras, track_secs) = track(args, &settings(gaussians, &fitted), gpu)?;
+        if others.is_none() {
+            let mut settings = settings(gaussians, &args.novel);
+            settings.session.tracking.solver = Solver::None;
+            settings.body = Some(take.avatar.template.clone().into());
+            others = Some(track(args, &settings, gpu)?.1);
+        }
+        let novel = others.as_deref().unwrap_or_default();
         for &variant in &args.variant {
-            // Tracking is deterministic: every variant is fitted to the same poses.
-            let (take, held, cameras, track_secs) = track(args, &training, gpu)?;
-            if others.is_none() {
-                let mut settings = settings(gaussians, &args.novel);
-                settings.session.tracking.solver = Solver::None;
-                settings.body = Some(take.avatar.template.clone().into());
-                others = Some(track(args, &settings, gpu)?.1);
-            }
-            let novel = others.as_deref().unwrap_or_default();
-            costs.push(fit(args, gpu, take, (&held, novel, &cameras), track_secs, variant, &mut rows)?);
+            costs.push(fit(args, gpu, &take, (&held, novel, &cameras), track_secs, variant, &mut rows)?);
             write(args, &rows, &costs)?;
         }
     }
@@ -274,19 +273,20 @@ fn scored(
 fn fit(
     args: &BenchAvatarArgs,
     gpu: &GpuContext,
-    take: AvatarTake,
+    take: &AvatarTake,
     (held, novel, cameras): (&[Held], &[Held], &[Camera]),
     track_secs: f64,
     variant: Variant,
     rows: &mut Vec<Row>,
 ) -> Result<Cost> {
-    let AvatarTake { frames, views, mut avatar, uvs, .. } = take;
+    let AvatarTake { frames, views, uvs, .. } = take;
+    let mut avatar = take.avatar.clone();
     let gaussians = avatar.gaussians();
     let mut scene = AvatarScene::new(gpu, &avatar)?;
     let settings = variant.fit_settings(FitSettings { pull: args.pull, ..FitSettings::default() });
-    let mut fit = Fit::new(gpu, &avatar, frames, views, settings)?;
+    let mut fit = Fit::new(gpu, &avatar, frames.clone(), views.clone(), settings)?;
     if let Some(local) = variant.local_settings() {
-        fit.use_networks(&mut avatar, &uvs, &local)?;
+        fit.use_networks(&mut avatar, uvs, &local)?;
     }
     let by_steps = !args.steps.is_empty();
     let ends: Vec<f64> =

@@ -1,21 +1,22 @@
 //! `flyrig-bench budget`: error in views and saved run time of each kind of work that a budget may skip.
 
-use std::{fmt::Write as _, time::Instant};
+use std::{fmt::Write as _, path::PathBuf, time::Instant};
 
-use crate::harness::arguments::RecordedArgs;
 use anyhow::{Context, Result};
 use clap::Args;
 use flyrig_fusion::{BudgetSettings, Effort, Origin, Outcome, PersonId, Solver};
 use flyrig_gpu::GpuContext;
 use flyrig_metrics::{CameraScore, ScoreSheet, score_view};
-use flyrig_report::arguments::{GaussiansArgs, OutputArgs};
 use flyrig_report::{
-    Replay, frame_number,
+    Replay,
+    arguments::{GaussiansArgs, OutputArgs},
+    frame_number,
     plot::{Line, Plot, Series},
     progress_bar, stop, write_whole,
 };
 use serde::Serialize;
-use std::path::PathBuf;
+
+use crate::harness::arguments::RecordedArgs;
 
 /// Arguments of the command.
 #[derive(Debug, Args)]

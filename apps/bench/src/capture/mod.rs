@@ -14,15 +14,15 @@ use std::{
     time::{Duration, Instant},
 };
 
-use crate::harness::arguments::PlainCameras;
 use anyhow::{Result, ensure};
 use clap::Args;
 use flyrig_capture::{CameraSource, FrameStage as _, JpegEncoding, Pacing};
 use flyrig_fusion::{InputFormat, Intake, resident_mib};
-use flyrig_report::arguments::parse_minutes;
-use flyrig_report::stop;
+use flyrig_report::{arguments::parse_minutes, stop};
 use flyrig_sync::SyncSettings;
 use flyrig_types::{Frame, Image, PixelFormat};
+
+use crate::harness::arguments::PlainCameras;
 use processor_time::{cpu_share, cpu_ticks};
 use steady::{Steady, host_clock};
 

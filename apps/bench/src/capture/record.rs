@@ -3,25 +3,26 @@
 //! Plain cameras of this process deliver images of a simulated person with sensor noise, as YUYV.
 
 use std::{
-    path::Path,
+    path::{Path, PathBuf},
     sync::{Arc, Mutex, atomic::Ordering},
     time::{Duration, Instant},
 };
 
-use super::processor_time::{cpu_share, cpu_ticks};
-use super::steady::{Steady, host_clock};
-use crate::harness::arguments::PlainCameras;
 use anyhow::{Context as _, Result, ensure};
 use clap::Args;
 use flyrig_capture::{
     CameraSource, CaptureThreads, Compression, McapReplay, Recorded, Recorder, ThreadsConfig, to_rgb8,
 };
 use flyrig_gpu::GpuContext;
-use flyrig_report::arguments::parse_seconds;
-use flyrig_report::stop;
+use flyrig_report::{arguments::parse_seconds, stop};
 use flyrig_sim::{SensorConfig, SimConfig, SimTime, Simulator};
 use flyrig_types::{CameraId, Image, PixelFormat};
-use std::path::PathBuf;
+
+use super::{
+    processor_time::{cpu_share, cpu_ticks},
+    steady::{Steady, host_clock},
+};
+use crate::harness::arguments::PlainCameras;
 
 /// Arguments of the command.
 #[derive(Debug, Args)]

@@ -1,9 +1,5 @@
 //! A variant of the tracking, and its result.
 
-use crate::harness::{
-    sequence::{SequenceConfig, SequenceMotion, SimulatedSequence},
-    surface::Points,
-};
 use anyhow::{Context, Result};
 use flyrig_fusion::{
     BodySettings, DeformOptions, GivenPerception, PROCESSOR_STAGE, PersonId, Session, SessionBuilder, SessionSettings,
@@ -13,6 +9,11 @@ use flyrig_gpu::GpuContext;
 use flyrig_metrics::{ScoreSheet, score_view};
 use flyrig_tracker::FIRST_FRAMES;
 use serde::Serialize;
+
+use crate::harness::{
+    sequence::{SequenceConfig, SequenceMotion, SimulatedSequence},
+    surface::Points,
+};
 
 /// Number of points on the tracked surface.
 const OUR_POINTS: usize = 20_000;

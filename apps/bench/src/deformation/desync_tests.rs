@@ -1,9 +1,10 @@
 //! Cameras without a common exposure.
 
-use super::case::{Case, CaseRow, run_session, session};
-use crate::harness::sequence::{SequenceConfig, SequenceMotion, SimulatedSequence};
 use flyrig_fusion::Solver;
 use flyrig_gpu::{AdapterChoice, GpuContext};
+
+use super::case::{Case, CaseRow, run_session, session};
+use crate::harness::sequence::{SequenceConfig, SequenceMotion, SimulatedSequence};
 
 const SIDE: u32 = 160;
 

@@ -2,24 +2,27 @@
 
 use std::{fmt::Write as _, ops::Range};
 
-use super::case::{Case, chamfer_mm, session};
-use super::cases::VIEWS;
-use crate::harness::{
-    arguments::SimulationArgs,
-    sequence::{SequenceConfig, SequenceMotion, SimulatedSequence},
-};
 use anyhow::{Context, Result};
 use clap::Args;
 use flyrig_fusion::{GivenPerception, Solver, resident_mib};
 use flyrig_gpu::GpuContext;
 use flyrig_metrics::{ScoreSheet, score_view};
-use flyrig_report::arguments::{GaussiansArgs, OutputArgs};
 use flyrig_report::{
+    arguments::{GaussiansArgs, OutputArgs},
     plot::{Line, Plot, Series},
     progress_bar, stop, write_whole,
 };
 use flyrig_types::PoseTrack;
 use serde::Serialize;
+
+use super::{
+    case::{Case, chamfer_mm, session},
+    cases::VIEWS,
+};
+use crate::harness::{
+    arguments::SimulationArgs,
+    sequence::{SequenceConfig, SequenceMotion, SimulatedSequence},
+};
 
 /// Arguments of the command.
 #[derive(Debug, Args)]

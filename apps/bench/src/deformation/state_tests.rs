@@ -2,11 +2,12 @@
 
 use std::sync::Arc;
 
-use super::case::{Case, session};
-use crate::harness::sequence::{SequenceConfig, SequenceMotion, SimulatedSequence};
 use flyrig_fusion::{Outcome, PersonId, Session, Solver, Subject, TrackState, TrackWatch};
 use flyrig_gpu::{AdapterChoice, GpuContext};
 use flyrig_types::{Frame, FrameSet, Image, Mask, PixelFormat};
+
+use super::case::{Case, session};
+use crate::harness::sequence::{SequenceConfig, SequenceMotion, SimulatedSequence};
 
 const SIDE: u32 = 96;
 const PERIOD_NANOS: i64 = 33_333_333;

@@ -1,9 +1,12 @@
 //! Summary of the rows of `flyrig-bench track`: tables, growth of the run time, savings and costs of skipped work.
 
-use super::case::CaseRow;
-use super::cases::{ALL_DETAIL, ALL_GAUSSIANS, ALL_VIEWS, FULL_SIZE, NO_REST, VIEWS, small};
-use crate::harness::{sequence::SequenceMotion, statistics::exponent};
 use std::fmt::Write as _;
+
+use super::{
+    case::CaseRow,
+    cases::{ALL_DETAIL, ALL_GAUSSIANS, ALL_VIEWS, FULL_SIZE, NO_REST, VIEWS, small},
+};
+use crate::harness::{sequence::SequenceMotion, statistics::exponent};
 
 /// Formats the summary for the terminal.
 pub fn summary(rows: &[CaseRow]) -> String {

@@ -1,20 +1,24 @@
 //! `flyrig-bench track`: error against run time of the deformation, on simulated people whose surface is known.
 
-use super::case::{Case, run_case};
-use super::cases::{ALL_DETAIL, ALL_GAUSSIANS, ALL_VIEWS, FULL_SIZE, NO_REST, VIEWS, small};
-use super::summary;
-use super::write;
-use crate::harness::{
-    arguments::SimulationArgs,
-    sequence::{SequenceConfig, SequenceMotion, SimulatedSequence},
-};
 use anyhow::{Result, ensure};
 use clap::{Args, builder::TypedValueParser as _};
 use flyrig_fusion::{PAPER_COLOR_WEIGHT, Solver};
 use flyrig_gpu::GpuContext;
-use flyrig_report::arguments::{GaussiansArgs, OutputArgs};
-use flyrig_report::progress_bar;
+use flyrig_report::{
+    arguments::{GaussiansArgs, OutputArgs},
+    progress_bar,
+};
 use flyrig_tracker::DeformSolver;
+
+use super::{
+    case::{Case, run_case},
+    cases::{ALL_DETAIL, ALL_GAUSSIANS, ALL_VIEWS, FULL_SIZE, NO_REST, VIEWS, small},
+    summary, write,
+};
+use crate::harness::{
+    arguments::SimulationArgs,
+    sequence::{SequenceConfig, SequenceMotion, SimulatedSequence},
+};
 
 /// Arguments of the command.
 #[derive(Debug, Args)]

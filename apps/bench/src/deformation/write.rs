@@ -2,7 +2,6 @@
 
 use std::{fmt::Write as _, path::Path};
 
-use super::{case::CaseRow, cases::ALL_VIEWS, summary::summary};
 use anyhow::Result;
 use flyrig_fusion::Solver;
 use flyrig_report::{
@@ -10,6 +9,8 @@ use flyrig_report::{
     write_whole,
 };
 use serde::Serialize;
+
+use super::{case::CaseRow, cases::ALL_VIEWS, summary::summary};
 
 #[derive(Serialize)]
 struct Document<'a> {

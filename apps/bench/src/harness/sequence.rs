@@ -2,7 +2,6 @@
 
 use std::sync::Arc;
 
-use super::{images::copy, surface::Points};
 use anyhow::{Context, Result};
 use flyrig_body::Template;
 use flyrig_gpu::GpuContext;
@@ -10,6 +9,8 @@ use flyrig_sim::{MotionConfig, MotionKind, RingConfig, SimConfig, Simulator, Sur
 use flyrig_types::{Camera, Frame, FrameSet, Image, PoseTrack, Rig};
 use glam::DVec3;
 use serde::Serialize;
+
+use super::{images::copy, surface::Points};
 
 /// Number of points on the true surface at which completeness is measured.
 const TRUE_POINTS: usize = 20_000;

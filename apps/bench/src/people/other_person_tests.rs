@@ -2,11 +2,12 @@
 
 use std::sync::Arc;
 
-use crate::harness::images::copy;
 use flyrig_fusion::{EstimatedPerception, Origin, Perception as _, PerceptionSettings, StageTimes};
 use flyrig_gpu::{AdapterChoice, GpuContext};
 use flyrig_sim::{Build, MotionConfig, MotionKind, PersonConfig, RingConfig, SimConfig, Simulator};
 use flyrig_types::{Frame, FrameSet, Image};
+
+use crate::harness::images::copy;
 
 /// Time between frame sets while a person is visible, and while none is.
 const STEP_NANOS: i64 = 200_000_000;

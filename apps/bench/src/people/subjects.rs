@@ -5,13 +5,6 @@
 
 use std::{collections::BTreeMap, path::Path, time::Instant};
 
-use crate::harness::{
-    arguments::SimulationArgs,
-    images::copy,
-    joints::hips,
-    people::{HELD_OUT, INPUTS, capture, frame_set},
-    statistics::mean,
-};
 use anyhow::{Context, Result};
 use clap::{Args, builder::TypedValueParser as _};
 use flyrig_body::{ShapeParams, default_template};
@@ -21,10 +14,20 @@ use flyrig_fusion::{
 };
 use flyrig_gpu::GpuContext;
 use flyrig_metrics::{ScoreSheet, score_view};
-use flyrig_report::arguments::{GaussiansArgs, OutputArgs};
-use flyrig_report::{png, progress_bar, write_whole};
+use flyrig_report::{
+    arguments::{GaussiansArgs, OutputArgs},
+    png, progress_bar, write_whole,
+};
 use flyrig_sim::{MotionConfig, MotionKind, RingConfig, SimConfig, Simulator};
 use flyrig_types::{Image, Mask, RenderedView, Rig};
+
+use crate::harness::{
+    arguments::SimulationArgs,
+    images::copy,
+    joints::hips,
+    people::{HELD_OUT, INPUTS, capture, frame_set},
+    statistics::mean,
+};
 
 /// Arguments of the command.
 #[derive(Debug, Args)]

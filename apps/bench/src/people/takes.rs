@@ -2,13 +2,6 @@
 
 use std::{collections::BTreeMap, time::Instant};
 
-use crate::harness::{
-    arguments::SimulationArgs,
-    images::copy,
-    joints::hips,
-    people::{INPUTS, frame_set},
-    statistics::mean,
-};
 use anyhow::Result;
 use clap::{Args, builder::TypedValueParser as _};
 use flyrig_body::{ShapeParams, default_template};
@@ -16,11 +9,21 @@ use flyrig_fusion::{
     EstimatedPerception, KnownPerson, Observation, Perception as _, PerceptionSettings, PersonId, StageTimes,
 };
 use flyrig_gpu::GpuContext;
-use flyrig_report::arguments::{FpsArgs, OutputArgs, parse_seconds};
-use flyrig_report::{progress_bar, write_whole};
+use flyrig_report::{
+    arguments::{FpsArgs, OutputArgs, parse_seconds},
+    progress_bar, write_whole,
+};
 use flyrig_sim::{MotionConfig, MotionKind, RingConfig, SceneConfig, SimConfig, Simulator};
 use flyrig_types::{Image, Rig};
 use glam::DVec3;
+
+use crate::harness::{
+    arguments::SimulationArgs,
+    images::copy,
+    joints::hips,
+    people::{INPUTS, frame_set},
+    statistics::mean,
+};
 
 /// Arguments of the command.
 #[derive(Debug, Args)]

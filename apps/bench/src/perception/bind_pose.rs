@@ -2,9 +2,10 @@
 
 use std::collections::BTreeMap;
 
-use crate::harness::{joints::JOINTS, surface::Points};
 use flyrig_body::Template;
 use glam::{DVec3, Vec3};
+
+use crate::harness::{joints::JOINTS, surface::Points};
 
 /// Measured points on each surface, and points that they are measured to: about 2 mm apart, so that the distance of a surface to itself
 /// is 1 mm.

@@ -1,9 +1,7 @@
 //! `flyrig-bench hands`: fingertips and the head's rotation on simulated people, and the cost of a crop.
 
-use std::sync::Arc;
-use std::time::Instant;
+use std::{path::PathBuf, sync::Arc, time::Instant};
 
-use crate::harness::statistics::{mean, percentile};
 use anyhow::{Context, Result};
 use clap::{Args, builder::TypedValueParser as _};
 use flyrig_gpu::GpuContext;
@@ -15,7 +13,8 @@ use flyrig_tracker::{
 };
 use flyrig_types::{Frame, FrameSet, Image, Mask, Pose};
 use glam::DVec3;
-use std::path::PathBuf;
+
+use crate::harness::statistics::{mean, percentile};
 
 /// Arguments of the command.
 #[derive(Debug, Args)]

@@ -2,15 +2,15 @@
 //!
 //! The result is the table in `tracker/src/habits.rs`.
 
+use std::path::PathBuf;
+
 use anyhow::{Context, Result};
 use clap::Args;
 use flyrig_body::load_gltf;
 use flyrig_capture::{FolderOptions, FolderReplay};
 use flyrig_fusion::next_frame;
-use flyrig_report::arguments::FpsArgs;
-use flyrig_report::{dataset, progress_bar};
+use flyrig_report::{arguments::FpsArgs, dataset, progress_bar};
 use flyrig_tracker::{Doubt, LANDMARK_NAMES, LandmarkStudy, PoseNet};
-use std::path::PathBuf;
 
 /// Arguments of the command.
 #[derive(Debug, Args)]

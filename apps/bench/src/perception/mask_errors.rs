@@ -2,11 +2,12 @@
 
 use std::path::Path;
 
-use crate::harness::images::coverage;
 use anyhow::{Context, Result};
 use flyrig_metrics::mask_iou;
 use flyrig_types::Mask;
 use serde::Serialize;
+
+use crate::harness::images::coverage;
 
 /// Half width of the band around the true outline in which alpha is compared, pixels.
 const BAND_PX: i64 = 3;

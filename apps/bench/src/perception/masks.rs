@@ -1,16 +1,16 @@
 //! `flyrig-bench masks`: masks estimated in each camera independently, against which several calibrations are scored.
 
+use std::path::PathBuf;
+
 use anyhow::{Context as _, Result};
 use clap::Args;
 use flyrig_body::{ShapeParams, default_template};
 use flyrig_capture::{FolderOptions, FolderReplay};
 use flyrig_fusion::SetReader;
-use flyrig_report::arguments::FpsArgs;
-use flyrig_report::{dataset, frame_number, png, progress_bar, write_whole};
+use flyrig_report::{arguments::FpsArgs, dataset, frame_number, png, progress_bar, write_whole};
 use flyrig_sync::SyncSettings;
 use flyrig_tracker::{PoseConfig, PoseNet, Viewers};
 use flyrig_types::Rig;
-use std::path::PathBuf;
 
 /// Arguments of the command.
 #[derive(Debug, Args)]

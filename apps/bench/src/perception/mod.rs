@@ -19,23 +19,27 @@ use std::{
     time::Instant,
 };
 
-use crate::harness::{
-    arguments::RecordedArgs,
-    joints::{JOINTS, places},
-    statistics::{mean, percentile},
-};
 use anyhow::{Context, Result, ensure};
 use clap::Args;
 use flyrig_body::{ShapeParams, Template, default_template, load_gltf};
 use flyrig_fusion::{BodySettings, Origin, Outcome, PerceptionSettings, PersonId, SessionSettings};
 use flyrig_gpu::GpuContext;
 use flyrig_metrics::{CameraScore, ScoreSheet, score_view};
-use flyrig_report::arguments::{GaussiansArgs, OutputArgs};
-use flyrig_report::{Replay, ReplaySettings, dataset, progress_bar, write_whole};
+use flyrig_report::{
+    Replay, ReplaySettings,
+    arguments::{GaussiansArgs, OutputArgs},
+    dataset, progress_bar, write_whole,
+};
 use flyrig_types::{Frame, FrameSet, Pose};
 use glam::DVec3;
-use mask_errors::{MaskErrors, write_errors};
 use serde::Serialize;
+
+use crate::harness::{
+    arguments::RecordedArgs,
+    joints::{JOINTS, places},
+    statistics::{mean, percentile},
+};
+use mask_errors::{MaskErrors, write_errors};
 
 /// Arguments of the command.
 #[derive(Debug, Args)]

@@ -5,26 +5,29 @@
 
 use std::{collections::BTreeMap, path::Path, sync::Arc};
 
-use crate::harness::{
-    arguments::SimulationArgs,
-    images::copy,
-    joints::{JOINTS, places},
-    statistics::{mean, percentile},
-};
 use anyhow::Result;
 use clap::{Args, builder::TypedValueParser as _};
 use flyrig_body::{ShapeParams, default_template};
 use flyrig_fusion::{EstimatedPerception, Observation, Perception as _, PerceptionSettings, SeenPerson, StageTimes};
 use flyrig_gpu::GpuContext;
 use flyrig_metrics::mask_iou;
-use flyrig_report::arguments::{FpsArgs, OutputArgs};
-use flyrig_report::{paint_outline, png, progress_bar, write_whole};
+use flyrig_report::{
+    arguments::{FpsArgs, OutputArgs},
+    paint_outline, png, progress_bar, write_whole,
+};
 use flyrig_sim::{
     Build, LightConfig, LightSwitch, MotionConfig, MotionKind, PersonConfig, RingConfig, SceneConfig, SceneKind,
     SimConfig, Simulator,
 };
 use flyrig_types::{Frame, FrameSet, Image, Mask, PixelFormat};
 use glam::{DQuat, DVec3};
+
+use crate::harness::{
+    arguments::SimulationArgs,
+    images::copy,
+    joints::{JOINTS, places},
+    statistics::{mean, percentile},
+};
 
 /// Arguments of the command.
 #[derive(Debug, Args)]

@@ -3,10 +3,6 @@
 
 use std::{fmt::Write as _, time::Instant};
 
-use crate::harness::{
-    sequence::{SequenceConfig, SequenceMotion, SimulatedSequence},
-    statistics::exponent,
-};
 use anyhow::{Context, Result};
 use clap::{Args, builder::TypedValueParser as _};
 use flyrig_body::{ShapeParams, default_template};
@@ -16,12 +12,17 @@ use flyrig_fusion::{
 };
 use flyrig_gpu::GpuContext;
 use flyrig_metrics::{CameraScore, ScoreSheet, score_view};
-use flyrig_report::arguments::OutputArgs;
 use flyrig_report::{
+    arguments::OutputArgs,
     plot::{Line, Plot, Series},
     progress_bar, write_whole,
 };
 use serde::Serialize;
+
+use crate::harness::{
+    sequence::{SequenceConfig, SequenceMotion, SimulatedSequence},
+    statistics::exponent,
+};
 
 /// Arguments of the command.
 #[derive(Debug, Args)]

@@ -13,8 +13,10 @@ use anyhow::{Context, Result, ensure};
 use flyrig_fusion::PersonFrame;
 use flyrig_renderer::{linear_from_srgb, srgb_from_linear};
 
-use super::forms::{Coded, Form, StreamForm};
-use super::take::{CodedTake, Kept};
+use super::{
+    forms::{Coded, Form, StreamForm},
+    take::{CodedTake, Kept},
+};
 
 /// Bytes of the headers of an IVF file, which ffmpeg writes, and of each of its frames, which starts with its size.
 const FILE_HEADER: usize = 32;

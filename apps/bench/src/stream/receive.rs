@@ -2,7 +2,7 @@
 
 use std::{
     collections::BTreeMap,
-    path::Path,
+    path::{Path, PathBuf},
     sync::{
         Arc,
         mpsc::{Receiver, SyncSender, sync_channel},
@@ -17,15 +17,13 @@ use flyrig_access::{KeyFile, Role};
 use flyrig_capture::recorded_messages;
 use flyrig_gpu::GpuContext;
 use flyrig_metrics::{Picture, person_box, psnr};
-use flyrig_report::arguments::parse_seconds;
-use flyrig_report::{progress_bar, stop, write_whole};
+use flyrig_report::{arguments::parse_seconds, progress_bar, stop, write_whole};
 use flyrig_stream::{Posed, StreamTemplate, stamp_of};
 use flyrig_transport::{FetchedTemplate, Interests, PersonMessage, Subscriber, TemplateFetcher, TransportConfig};
 use flyrig_types::{Camera, Mask, RenderedView};
 use flyrig_viewer::{Scene, age_secs, clock_secs};
 use flyrig_viewing::{People, Taken};
 use serde::Serialize;
-use std::path::PathBuf;
 
 /// Arguments of the command.
 #[derive(Debug, Args)]

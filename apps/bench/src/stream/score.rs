@@ -5,9 +5,11 @@ use flyrig_metrics::{CameraScore, Picture, ScoreSheet, person_box, psnr, score_v
 use flyrig_types::{Mask, RenderedView};
 use flyrig_viewer::{Scene, ShownPerson};
 
-use super::forms::Coded;
-use super::table::FormRow;
-use super::take::{CodedTake, Kept};
+use super::{
+    forms::Coded,
+    table::FormRow,
+    take::{CodedTake, Kept},
+};
 
 /// Sums of an encoding over its frames.
 #[derive(Default)]

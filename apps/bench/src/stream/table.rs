@@ -2,10 +2,11 @@
 
 use std::fmt::Write as _;
 
-use crate::harness::statistics::exponent;
 use flyrig_fusion::Origin;
 use flyrig_report::plot::{Line, Plot, Series};
 use serde::Serialize;
+
+use crate::harness::statistics::exponent;
 
 /// Result of one data set in one encoding.
 #[derive(Debug, Serialize)]

@@ -5,9 +5,6 @@ use std::{
     sync::Arc,
 };
 
-use super::arguments::BenchStreamArgs;
-use super::subject::{CodedSubject, SIMULATED};
-use crate::harness::images::copy;
 use anyhow::{Context, Result, ensure};
 use flyrig_fusion::{BudgetSettings, Origin, Outcome, PersonFrame, PersonId, Session};
 use flyrig_gpu::GpuContext;
@@ -17,6 +14,12 @@ use flyrig_sim::{ExportOptions, MotionConfig, MotionKind, SimConfig, Simulator, 
 use flyrig_stream::EncodedTemplate;
 use flyrig_transport::SplatState;
 use flyrig_types::{Camera, Image, Mask, RenderedView};
+
+use super::{
+    arguments::BenchStreamArgs,
+    subject::{CodedSubject, SIMULATED},
+};
+use crate::harness::images::copy;
 
 /// Frame sets that are neither counted nor scored: colours are sent for the first time.
 const WARM_UP: usize = 12;

@@ -1,23 +1,21 @@
 //! `flyrig avatar build`: tracks the person of a take, then fits an avatar to its images.
 
 use std::{
-    path::Path,
+    path::{Path, PathBuf},
     time::{Duration, Instant},
 };
 
 use anyhow::{Context as _, Result, ensure};
+use clap::{Args, ValueEnum};
 use flyrig_avatar::{Avatar, AvatarScene, Bones, Card, Drawn, Fit, FitSettings, LocalSettings};
+use flyrig_body::DEFAULT_NODE_COUNT;
 use flyrig_fusion::BodySettings;
 use flyrig_gpu::GpuContext;
 use flyrig_renderer::HarmonicOrder;
-use flyrig_report::{AvatarTake, png, progress_bar, stop};
+use flyrig_report::{AvatarTake, arguments::parse_minutes, png, progress_bar, stop};
 
 use super::{checkpoint::Checkpoint, open_replay};
 use crate::arguments::DatasetArgs;
-use clap::{Args, ValueEnum};
-use flyrig_body::DEFAULT_NODE_COUNT;
-use flyrig_report::arguments::parse_minutes;
-use std::path::PathBuf;
 
 /// Default number of Gaussians, about 7 mm apart on an adult.
 const GAUSSIANS: u32 = 41_000;

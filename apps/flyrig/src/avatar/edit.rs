@@ -1,14 +1,15 @@
 //! `flyrig avatar edit`: another texture, another shape.
 
+use std::path::PathBuf;
+
 use anyhow::{Result, ensure};
+use clap::Args;
 use flyrig_body::ShapeParams;
 
 use super::{
     export::{TextureArgs, read_texture},
     load,
 };
-use clap::Args;
-use std::path::PathBuf;
 
 /// Arguments of `flyrig avatar edit`.
 #[derive(Debug, Args)]

@@ -1,8 +1,12 @@
 //! `flyrig avatar eval`: an avatar against held-out cameras.
 
-use std::time::{Duration, Instant};
+use std::{
+    path::PathBuf,
+    time::{Duration, Instant},
+};
 
 use anyhow::{Context as _, Result, ensure};
+use clap::Args;
 use flyrig_avatar::{Avatar, DetailedScene};
 use flyrig_fusion::{BodySettings, Outcome, PersonId, Solver};
 use flyrig_gpu::GpuContext;
@@ -12,8 +16,6 @@ use serde::Serialize;
 
 use super::{load, open_replay, parts::score_parts, print_far};
 use crate::arguments::{DatasetArgs, HoldoutArgs};
-use clap::Args;
-use std::path::PathBuf;
 
 /// Arguments of `flyrig avatar eval`.
 #[derive(Debug, Args)]

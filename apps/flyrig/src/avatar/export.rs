@@ -1,9 +1,10 @@
 //! `flyrig avatar export`: an avatar for other programs.
 
-use std::path::Path;
+use std::path::{Path, PathBuf};
 
 use anyhow::{Context as _, Result, bail, ensure};
-use flyrig_avatar::{Atlas, Avatar, Bones, PosedAvatar, write_splat_glb};
+use clap::Args;
+use flyrig_avatar::{Atlas, Avatar, Bones, DEFAULT_ATLAS_SIDE, PosedAvatar, write_splat_glb};
 use flyrig_body::{GlbContents, write_glb};
 use flyrig_renderer::{AnisotropicSplats, write_anisotropic_ply};
 use flyrig_report::{png, write_whole};
@@ -14,9 +15,6 @@ use super::{
     load,
     render::{motion, pose_at},
 };
-use clap::Args;
-use flyrig_avatar::DEFAULT_ATLAS_SIDE;
-use std::path::PathBuf;
 
 /// Arguments of `flyrig avatar export`.
 #[derive(Debug, Args)]

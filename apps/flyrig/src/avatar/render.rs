@@ -1,19 +1,23 @@
 //! `flyrig avatar render`: an avatar driven by a recorded motion.
 
-use std::path::Path;
+use std::{
+    ops::Range,
+    path::{Path, PathBuf},
+};
 
 use anyhow::{Context as _, Result, bail};
+use clap::Args;
 use flyrig_avatar::{Avatar, DetailedScene};
 use flyrig_body::{RetargetOptions, load_bvh, load_gltf};
 use flyrig_gpu::GpuContext;
-use flyrig_report::{png, progress_bar, stop};
+use flyrig_report::{
+    arguments::{parse_range, parse_size},
+    png, progress_bar, stop,
+};
 use flyrig_types::{Camera, Intrinsics, Isometry, Lens, Pose, PoseTrack};
 use glam::{DQuat, DVec2, DVec3};
 
 use super::{load, print_far};
-use clap::Args;
-use flyrig_report::arguments::{parse_range, parse_size};
-use std::{ops::Range, path::PathBuf};
 
 /// Arguments of `flyrig avatar render`.
 #[derive(Debug, Args)]

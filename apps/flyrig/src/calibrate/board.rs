@@ -1,13 +1,14 @@
 //! `flyrig calibrate board`: boards to print.
 
 use anyhow::{Context as _, Result, anyhow};
+use clap::{Args, ValueEnum};
 use flyrig_calib::{Board, BoardSheet, Pattern};
 use flyrig_report::write_whole;
 
 use super::refuse_existing;
 use crate::arguments::TargetArgs;
-use clap::{Args, ValueEnum};
 
+/// Arguments of `flyrig calibrate board`.
 #[derive(Debug, Args)]
 #[command(mut_arg("out", |arg| arg.required(false).default_value("board")))]
 pub struct CalibrateBoardArgs {

@@ -1,6 +1,7 @@
 //! `flyrig calibrate color`: colours of the cameras, matched by people whom several of them see.
 
 use anyhow::{Context as _, Result, ensure};
+use clap::Args;
 use flyrig_body::{ShapeParams, default_template};
 use flyrig_calib::{CameraColors, ColorFit, ColorPoint, ColorSample, match_colors, save_calibration};
 use flyrig_fusion::{
@@ -14,10 +15,12 @@ use glam::DVec2;
 use serde_json::json;
 
 use super::{FILES, refuse_existing};
-use crate::arguments::{CalibrationArgs, InputArgs, SpanArgs, TargetArgs};
-use crate::take::{self, CalibratedTake};
-use clap::Args;
+use crate::{
+    arguments::{CalibrationArgs, InputArgs, SpanArgs, TargetArgs},
+    take::{self, CalibratedTake},
+};
 
+/// Arguments of `flyrig calibrate color`.
 #[derive(Debug, Args)]
 #[command(mut_arg("secs", |arg| arg.default_value("10")))]
 pub struct CalibrateColorArgs {

@@ -1,15 +1,17 @@
 //! `flyrig calibrate convert`: calibrations of other programs.
 
+use std::path::PathBuf;
+
 use anyhow::{Context as _, Result, bail, ensure};
+use clap::Args;
 use flyrig_calib::{Format, save_lenses};
 use flyrig_capture::folder_image_size;
 use flyrig_types::ColorMatch;
 
 use super::refuse_existing;
 use crate::arguments::TargetArgs;
-use clap::Args;
-use std::path::PathBuf;
 
+/// Arguments of `flyrig calibrate convert`.
 #[derive(Debug, Args)]
 pub struct CalibrateConvertArgs {
     /// File or folder of the other program; see --from.

@@ -1,6 +1,7 @@
 //! `flyrig calibrate lens`: the lenses of cameras, each by itself.
 
 use anyhow::{Context as _, Result};
+use clap::Args;
 use flyrig_calib::{Board, LensFit, calibrate_lens, save_lenses};
 use flyrig_gpu::GpuContext;
 use flyrig_report::stop;
@@ -11,8 +12,8 @@ use super::{
     views::{Seen, TakeArgs},
 };
 use crate::arguments::{BoardArgs, TargetArgs};
-use clap::Args;
 
+/// Arguments of `flyrig calibrate lens`.
 #[derive(Debug, Args)]
 pub struct CalibrateLensArgs {
     #[command(flatten)]

@@ -9,6 +9,7 @@ use std::{
 };
 
 use anyhow::{Result, ensure};
+use clap::Args;
 use flyrig_calib::{Board, BoardShot, CalibError, RigFit, RigOptions, calibrate_lens, calibrate_rig, load_lenses};
 use flyrig_gpu::GpuContext;
 use flyrig_monitor::PageServer;
@@ -21,13 +22,14 @@ use super::{
     advice::{Progress, Step, different},
     page, refuse_existing,
     rig::{self, PAGE, Target},
-    views::Seen,
-    views::TakeArgs,
+    views::{Seen, TakeArgs},
 };
-use crate::arguments::{BoardArgs, SolveArgs, TargetArgs};
-use crate::take;
-use clap::Args;
+use crate::{
+    arguments::{BoardArgs, SolveArgs, TargetArgs},
+    take,
+};
 
+/// Arguments of `flyrig calibrate live`.
 #[derive(Debug, Args)]
 #[command(mut_arg("secs", |arg| arg.default_value("1800")))]
 pub struct CalibrateLiveArgs {

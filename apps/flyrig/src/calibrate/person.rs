@@ -1,6 +1,7 @@
 //! `flyrig calibrate person`: better poses and time offsets of cameras from one person who moves.
 
 use anyhow::{Context as _, Result, ensure};
+use clap::Args;
 use flyrig_body::{ShapeParams, default_template};
 use flyrig_calib::{
     Deviation, OutlineCorner, PersonCamera, PersonFit, PersonOptions, PersonTracks, calibrate_person, save_calibration,
@@ -14,10 +15,12 @@ use glam::DVec2;
 use serde_json::json;
 
 use super::{FILES, refuse_existing};
-use crate::arguments::{CalibrationArgs, InputArgs, SpanArgs, TargetArgs};
-use crate::take::{self, CalibratedTake};
-use clap::Args;
+use crate::{
+    arguments::{CalibrationArgs, InputArgs, SpanArgs, TargetArgs},
+    take::{self, CalibratedTake},
+};
 
+/// Arguments of `flyrig calibrate person`.
 #[derive(Debug, Args)]
 pub struct CalibratePersonArgs {
     /// Take the cameras' stamps as they are.

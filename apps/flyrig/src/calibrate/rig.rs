@@ -3,6 +3,7 @@
 use std::path::Path;
 
 use anyhow::{Context as _, Result, ensure};
+use clap::Args;
 use flyrig_calib::{Board, Deviation, LensModel, RigFit, RigOptions, calibrate_rig, load_lenses, save_calibration};
 use flyrig_gpu::GpuContext;
 use flyrig_report::{stop, write_whole};
@@ -15,8 +16,8 @@ use super::{
     views::{Seen, TakeArgs},
 };
 use crate::arguments::{BoardArgs, SolveArgs, TargetArgs};
-use clap::Args;
 
+/// Arguments of `flyrig calibrate rig`.
 #[derive(Debug, Args)]
 pub struct CalibrateRigArgs {
     #[command(flatten)]

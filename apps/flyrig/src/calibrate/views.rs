@@ -7,20 +7,21 @@ use std::{
 };
 
 use anyhow::{Result, anyhow, ensure};
+use clap::Args;
 use flyrig_calib::{Board, BoardDetector, BoardShot, BoardView, GrayImage, detector};
 use flyrig_fusion::{InputFormat, Intake};
 use flyrig_gpu::GpuContext;
-use flyrig_report::{progress_bar, stop};
+use flyrig_report::{arguments::parse_seconds, progress_bar, stop};
 use flyrig_sync::SyncSettings;
 use flyrig_types::{CameraId, FrameSet};
 use rayon::prelude::*;
 
-use crate::arguments::InputArgs;
-use crate::arguments::parse_most_ms;
-use crate::take::{self, Take};
-use clap::Args;
-use flyrig_report::arguments::parse_seconds;
+use crate::{
+    arguments::{InputArgs, parse_most_ms},
+    take::{self, Take},
+};
 
+/// A take of a board, and the part that is used.
 #[derive(Debug, Args)]
 pub struct TakeArgs {
     /// Seconds of the input that are used.

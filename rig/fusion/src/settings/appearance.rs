@@ -90,12 +90,6 @@ pub struct AppearanceOptions {
 }
 
 impl AppearanceOptions {
-    /// Returns the defaults with another mode.
-    #[must_use]
-    pub fn of_mode(mode: AppearanceMode) -> Self {
-        Self { mode, ..Self::default() }
-    }
-
     /// Loads the networks that correct direct appearance; `None` for the direct modes.
     ///
     /// # Errors
