@@ -95,14 +95,14 @@ pub fn parse_speed(text: &str) -> Result<f64, String> {
     }
 }
 
-/// Parses 0.1 to 1000 frames a second.
+/// Parses 0.1 to 1000 frames per second.
 ///
 /// # Errors
 /// Says what was expected.
 pub fn parse_fps(text: &str) -> Result<f64, String> {
     match text.parse::<f64>() {
         Ok(fps) if (0.1..=1000.0).contains(&fps) => Ok(fps),
-        _ => Err(format!("'{text}' is not between 0.1 and 1000 frames a second")),
+        _ => Err(format!("'{text}' is not between 0.1 and 1000 frames per second")),
     }
 }
 

@@ -269,7 +269,7 @@ fn write(folder: &Path, rows: &[Row]) -> Result<()> {
     });
     let plot = Plot {
         title: "Run time against error, people never trained on".to_owned(),
-        x_label: "ms a frame, direct appearance and networks".to_owned(),
+        x_label: "ms per frame, direct appearance and networks".to_owned(),
         y_label: "-PSNR, dB".to_owned(),
         log_x: true,
         log_y: false,

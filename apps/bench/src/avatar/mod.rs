@@ -169,7 +169,7 @@ fn live(args: &BenchAvatarArgs, settings: &ReplaySettings, gpu: &GpuContext) -> 
         if (at - 1) % u64::from(args.every) != 0 {
             continue;
         }
-        let held = hold(&mut replay, &set)?.context("nobody was found in the first frame")?;
+        let held = hold(&mut replay, &set)?.context("no person was found in the first frame")?;
         for (camera, truth) in replay.holdout.clone().iter().zip(&held.truths) {
             let start = Instant::now();
             let view = replay.session.render(camera)?;
@@ -342,7 +342,7 @@ fn table(rows: &[Row], costs: &[Cost]) -> String {
     for Row { variant, gaussians, seconds, steps, view, pose } in rows {
         let _ = writeln!(text, "| {variant} | {gaussians} | {seconds:.0} | {steps} | {} | {} |", of(view), of(pose));
     }
-    text += "\n| drawn | Gaussians | tracking s | ms a step | posing ms | a view ms | file MB | resident MiB | novel view dB |\n|---|---|---|---|---|---|---|---|---|\n";
+    text += "\n| drawn | Gaussians | tracking s | ms per step | posing ms | view ms | file MB | resident MiB | novel view dB |\n|---|---|---|---|---|---|---|---|---|\n";
     let number =
         |value: f64, digits: usize| if value.is_finite() { format!("{value:.digits$}") } else { "-".to_owned() };
     for cost in costs {

@@ -160,7 +160,7 @@ fn run(args: &BenchBudgetArgs, gpu: &GpuContext, way: Way) -> Result<Row> {
     }
     anyhow::ensure!(
         replay.session.subject(PersonId::default()).is_some(),
-        "nobody was found in {}",
+        "no person was found in {}",
         args.dataset.display()
     );
     let score =
@@ -173,7 +173,7 @@ fn run(args: &BenchBudgetArgs, gpu: &GpuContext, way: Way) -> Result<Row> {
 
 fn table(rows: &[Row]) -> String {
     let mut text = String::from(
-        "| effort | ms a set | p95 | sets a second | PSNR dB | SSIM | FLIP | mask IoU | dB lost | ms saved | dB lost for 100 ms |\n\
+        "| effort | ms per frame set | p95 | frame sets per second | PSNR dB | SSIM | FLIP | mask IoU | dB lost | ms saved | dB lost for 100 ms |\n\
          |---|---|---|---|---|---|---|---|---|---|---|\n",
     );
     let Some(full) = rows.first() else { return text };
@@ -211,7 +211,7 @@ fn plot(rows: &[Row]) -> Plot {
     let (level, budget) = (|name: &str| name.starts_with("level"), |name: &str| name.starts_with("budget"));
     Plot {
         title: "Run time against loss of PSNR".to_owned(),
-        x_label: "milliseconds a set, one view drawn".to_owned(),
+        x_label: "milliseconds per frame set, one view drawn".to_owned(),
         y_label: "PSNR lost, dB".to_owned(),
         log_x: false,
         log_y: false,

@@ -121,7 +121,7 @@ fn report(
     let [width, height] = args.rig.size;
     let health = intake.health();
     let mut text = format!(
-        "{} cameras of {width}x{height} at {} a second (YUYV and MJPEG in turn) for {seconds:.1} s\n",
+        "{} cameras of {width}x{height} at {} per second (YUYV and MJPEG in turn) for {seconds:.1} s\n",
         args.rig.cameras, args.rig.fps
     );
     let _ = writeln!(
@@ -137,7 +137,7 @@ fn report(
     let warm: Vec<(f64, f64)> = memory.iter().copied().filter(|(secs, _)| *secs >= seconds * WARM_UP).collect();
     if let (Some((_, first)), Some((_, last))) = (warm.first(), warm.last()) {
         let slope = slope(&warm) * 3600.0;
-        let _ = writeln!(text, "memory: {first:.1} to {last:.1} MiB, slope {slope:+.2} MiB an hour");
+        let _ = writeln!(text, "memory: {first:.1} to {last:.1} MiB, slope {slope:+.2} MiB per hour");
     }
     for (thread, share) in cpu.iter().filter(|(_, share)| **share >= 0.0005) {
         let _ = writeln!(text, "processor: {:.2} % of a core by {thread}", share * 100.0);
@@ -203,7 +203,7 @@ mod tests {
             &[(0.0, 9.0), (1.0, 10.0), (2.0, 11.0)],
             &BTreeMap::new(),
         );
-        assert!(text.contains("2.00 ms p50, 3.00 ms p99") && text.contains("slope +3600.00 MiB an hour"), "{text}");
+        assert!(text.contains("2.00 ms p50, 3.00 ms p99") && text.contains("slope +3600.00 MiB per hour"), "{text}");
         if cfg!(target_os = "linux") {
             assert!(!cpu_ticks().is_empty());
         }

@@ -112,7 +112,7 @@ pub fn session(gpu: &GpuContext, sequence: &SimulatedSequence, case: &Case) -> R
 
 /// Spreads points over the surface of the last update.
 fn tracked_surface(session: &Session) -> Result<Points> {
-    let subject = session.subject(PersonId::default()).context("there is nobody")?;
+    let subject = session.subject(PersonId::default()).context("no person is tracked")?;
     let (positions, _) = subject.surface(subject.pose().context("no frame was used")?);
     Ok(Points::on(&positions, &subject.template().triangles, OUR_POINTS))
 }

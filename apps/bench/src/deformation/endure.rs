@@ -208,9 +208,9 @@ mod tests {
             simulation: SimulationArgs { seed: 1, side: 64 },
             surface: GaussiansArgs { gaussians: 2000 },
         };
-        let mut told = 0;
-        let points = run(&args, &gpu, &sequence, |frame, _| told = frame).unwrap();
-        assert_eq!(told, 15);
+        let mut last = 0;
+        let points = run(&args, &gpu, &sequence, |frame, _| last = frame).unwrap();
+        assert_eq!(last, 15);
         assert_eq!(points.iter().map(|p| p.frame).collect::<Vec<_>>(), [2, 6, 10, 14]);
         assert!(points.iter().all(|p| p.psnr_db > 10.0 && p.iou > 0.8 && p.chamfer_mm < 40.0), "{points:?}");
     }

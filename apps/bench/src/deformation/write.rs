@@ -82,7 +82,7 @@ fn pareto(rows: &[CaseRow]) -> Plot {
     };
     Plot {
         title: "Tracking: error over time".to_owned(),
-        x_label: "deformation, milliseconds a frame".to_owned(),
+        x_label: "deformation, milliseconds per frame".to_owned(),
         y_label: "Chamfer distance to the clothed surface, mm".to_owned(),
         log_x: true,
         log_y: false,

@@ -13,7 +13,7 @@ pub const HELD_OUT: [usize; 3] = [1, 3, 5];
 
 /// Composites the views of people by one camera, the nearest in front: image, mask, and the index of the person whom each pixel shows.
 fn composite(frames: &[SimFrame]) -> Result<(Image, Mask, Vec<usize>)> {
-    let first = frames.first().context("nobody was chosen")?;
+    let first = frames.first().context("no person was chosen")?;
     let (width, height) = (first.color.width(), first.color.height());
     let mut rgb = first.color.bytes().to_vec();
     let mut coverage = first.mask.coverage().to_vec();

@@ -115,7 +115,7 @@ pub fn subjects(args: &BenchSubjectsArgs, gpu: &GpuContext) -> Result<()> {
     rows.push(run(args, gpu, &rig, &mut people, format!("all {}", args.people), &all, &bar)?);
     bar.finish_and_clear();
     let mut table = String::from(
-        "| people | PSNR dB | on own pixels dB | mask IoU | hips mm | tracks that changed places | sets without a track | ms a set | ms a view |\n\
+        "| people | PSNR dB | on own pixels dB | mask IoU | hips mm | tracks that changed places | sets without a track | ms per frame set | ms per view |\n\
          |---|---|---|---|---|---|---|---|---|\n",
     );
     for row in &rows {

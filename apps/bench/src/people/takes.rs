@@ -83,7 +83,7 @@ pub fn takes(args: &BenchTakesArgs, gpu: &GpuContext) -> Result<()> {
     let sets = (args.secs * args.rate.fps).round().max(1.0) as u64;
     let bar = progress_bar(args.takes * sets, "bench takes");
     let mut table = String::from(
-        "| take | changes of a track | without a track | tracks on nobody | returns to the own track | to another | hips mm | ms a set \
+        "| take | changes of a track | without a track | tracks on no person | returns to the own track | to another | hips mm | ms per frame set \
          |\n|---|---|---|---|---|---|---|---|\n",
     );
     let mut total = Take::default();

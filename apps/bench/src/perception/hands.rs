@@ -99,7 +99,7 @@ pub fn hands(args: &BenchHandsArgs, gpu: &GpuContext) -> Result<()> {
         "head deg",
         "seen deg",
         "crops",
-        "ms a set"
+        "ms per frame set"
     );
     for &px in &args.px {
         let names = ["true, rest", "true, relaxed", "true, estimated", "estimated, relaxed", "estimated, estimated"];
@@ -267,7 +267,7 @@ fn cost(hand_net: &HandNet) -> Result<()> {
         face_net.run(&face)?;
     }
     let face_ms = start.elapsed().as_secs_f64() * 1e3 / f64::from(RUNS);
-    println!("hand network {hand_ms:.1} ms a crop, face network {face_ms:.1} ms a crop, one thread each");
+    println!("hand network {hand_ms:.1} ms per crop, face network {face_ms:.1} ms per crop, one thread each");
     Ok(())
 }
 

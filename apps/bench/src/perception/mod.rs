@@ -306,7 +306,7 @@ fn lengths(vectors: &[DVec3]) -> Vec<f64> {
 fn table(rows: &[Row]) -> String {
     let mut text = String::from(
         "| data | pose | shape | masks | joints mm | p95 | jitter | shape mm | mask IoU | boundary F | alpha in band | PSNR dB | SSIM | FLIP | \
-         IoU | lost | ms a set |\n|---|---|---|---|---|---|---|---|---|---|---|---|---|---|---|---|---|\n",
+         IoU | lost | ms per frame set |\n|---|---|---|---|---|---|---|---|---|---|---|---|---|---|---|---|---|\n",
     );
     for row in rows {
         let name = |origin| if origin == Origin::Given { "given" } else { "estimated" };

@@ -138,7 +138,7 @@ pub fn stress(args: &BenchStressArgs, gpu: &GpuContext) -> Result<()> {
     args.output.create()?;
     let mut table = String::from(
         "| disturbance | joints mm (95 %) before | during | after | mask IoU before | during | after | not found before | during | \
-         after | recovery s | ms a set |\n|---|---|---|---|---|---|---|---|---|---|---|---|\n",
+         after | recovery s | ms per frame set |\n|---|---|---|---|---|---|---|---|---|---|---|---|\n",
     );
     for (index, case) in CASES.iter().enumerate() {
         if !args.only.is_empty() && !args.only.iter().any(|part| case.name.contains(part.as_str())) {

@@ -185,7 +185,7 @@ fn run(pose: Origin, gpu: &GpuContext, sequence: &SimulatedSequence, axes: Vec<A
             sheet.extend(score_view(&camera.id, set.index, &view, &truth.image, truth.mask.as_ref())?);
         }
     }
-    anyhow::ensure!(session.has_people(), "nobody was found with {} cameras of {} pixels", size.views, size.side);
+    anyhow::ensure!(session.has_people(), "no person was found with {} cameras of {} pixels", size.views, size.side);
     let score = sheet.mean().with_context(|| format!("nothing to compare: give more than {WARM_UP} frames"))?;
     let (pose_ms, set_ms) = (pose_ms / count, set_ms / count);
     let rest_ms = set_ms - pose_ms;
@@ -210,7 +210,7 @@ impl Row {
 
 fn table(rows: &[Row]) -> String {
     let mut text = String::from(
-        "| image | cameras | Gaussians | pose ms | rest of the set ms | a view ms | all ms | PSNR dB | SSIM | FLIP | mask IoU |\n\
+        "| image | cameras | Gaussians | pose ms | rest of the set ms | view ms | all ms | PSNR dB | SSIM | FLIP | mask IoU |\n\
          |---|---|---|---|---|---|---|---|---|---|---|\n",
     );
     for row in rows {
@@ -259,7 +259,7 @@ fn plot(rows: &[Row]) -> Plot {
         Series { name: name.to_owned(), points, line: Line::Through }
     };
     Plot {
-        title: "Run time of a set with one view".to_owned(),
+        title: "Run time per frame set with one view".to_owned(),
         x_label: "times as many".to_owned(),
         y_label: "milliseconds".to_owned(),
         log_x: true,

@@ -47,7 +47,7 @@ fn pose(row: &FormRow) -> &'static str {
 /// Formats the table.
 pub fn table(rows: &[FormRow]) -> String {
     let mut text = String::from(
-        "| data set | pose, masks | form | Gaussians | KB a frame | p99 | motion KB | Mbit/s at 30 | template MB | dB to uncoded | worst | dB lost | SSIM lost | FLIP gained | flicker | encode ms | decode ms | pose ms |\n\
+        "| data set | pose, masks | form | Gaussians | KB per frame | p99 | motion KB | Mbit/s at 30 | template MB | dB to uncoded | worst | dB lost | SSIM lost | FLIP gained | flicker | encode ms | decode ms | pose ms |\n\
          |---|---|---|---|---|---|---|---|---|---|---|---|---|---|---|---|---|---|\n",
     );
     let number = |value: Option<f64>, digits: usize| value.map_or("-".to_owned(), |value| format!("{value:.digits$}"));
@@ -158,8 +158,8 @@ pub fn plot(rows: &[FormRow]) -> Plot {
         }
     }
     Plot {
-        title: "Bytes of a frame against quality".to_owned(),
-        x_label: "KB a frame".to_owned(),
+        title: "Bytes per frame against quality".to_owned(),
+        x_label: "KB per frame".to_owned(),
         y_label: "PSNR against the uncoded rendering, dB".to_owned(),
         log_x: true,
         log_y: false,
