@@ -102,7 +102,7 @@ if [ -n "${FLYRIG:-}" ]; then
   mkdir -p "$root/usr/share/vulkan/icd.d"
   cp /usr/share/vulkan/icd.d/lvp_icd*.json "$root/usr/share/vulkan/icd.d/"
   rm -rf "$work/rig"
-  printf '[sim]\nwidth = 320\nheight = 180\ntexture_px = 64\ncameras.count = 2\nmotion.kind = "still"\n' >"$work/sim.toml"
+  printf 'width = 320\nheight = 180\ntexture_px = 64\ncameras.count = 2\nmotion.kind = "still"\n' >"$work/sim.toml"
   "$FLYRIG" sim export "$work/sim.toml" --out "$work/rig" --frames 2 --no-truth
   cp -r "$work/rig" "$root/rig"
   copy_program "$FLYRIG" flyrig

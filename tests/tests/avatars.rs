@@ -145,9 +145,10 @@ fn a_build_that_was_killed_goes_on() {
 #[test]
 fn a_recording_gives_the_avatar_of_its_exported_folder() {
     let folder = tempfile::tempdir().unwrap();
-    let rig = "[source]\nkind = \"sim\"\nreal_time = false\ncameras = [\"00\", \"02\", \"04\"]\n\
-        [perception]\npose = \"given\"\nmasks = \"given\"\n[record]\njpeg_quality = 95\n\
-        [sim]\nseed = 5\nwidth = 192\nheight = 192\ntexture_px = 128\nframes = 6\ncameras.count = 6\n";
+    let rig = "[source]\nkind = \"sim\"\npath = \"sim.toml\"\nreal_time = false\ncameras = [\"00\", \"02\", \"04\"]\n\
+        [perception]\npose = \"given\"\nmasks = \"given\"\n[record]\njpeg_quality = 95\n";
+    let sim = "seed = 5\nwidth = 192\nheight = 192\ntexture_px = 128\nframes = 6\ncameras.count = 6\n";
+    std::fs::write(folder.path().join("sim.toml"), sim).unwrap();
     std::fs::write(folder.path().join("rig.toml"), rig).unwrap();
     let flyrig = |args: &[&str]| run(PROGRAM, args, folder.path()).unwrap();
     for args in
@@ -230,9 +231,9 @@ fn the_live_rig_starts_from_an_avatar() {
     // A rig that runs, with the body and the poses of the take.
     let endpoint = support::small_rig("avatars", folder.path(), "");
     let simulated = std::fs::read_to_string(folder.path().join("rig.toml")).unwrap();
-    let simulated = simulated.replace("texture_px = 128\n", "texture_px = 128\nframes = 3\n");
+    std::fs::write(folder.path().join("sim.toml"), format!("{}frames = 3\n", support::SMALL_SIM)).unwrap();
     let simulated = simulated.replace("[source]\n", "[source]\nreal_time = false\n");
-    let config = simulated.replace("[source]\n", &format!("[source]\nkind = \"folder\"\npath = {take:?}\n"));
+    let config = simulated.replace("path = \"sim.toml\"\n", &format!("kind = \"folder\"\npath = {take:?}\n"));
     let config = config.replace("[body]\n", &format!("[body]\ntemplate = {:?}\n", format!("{take}/subject.glb")));
     let with = |keys: &str| {
         let text = config.replace("nodes = 100\n", &format!("nodes = 100\n{keys}\n"));

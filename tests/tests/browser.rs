@@ -146,10 +146,11 @@ impl Shown {
     fn configure(self, folder: &Path, web: u16) -> (String, Option<Dataset>) {
         let file = folder.join("rig.toml");
         if self == Self::Person {
-            let more = format!("[sim.motion]\nkind = \"still\"\n[web]\nlisten = \"127.0.0.1:{web}\"\n");
+            let more = format!("[web]\nlisten = \"127.0.0.1:{web}\"\n");
             let endpoint = small_rig("browser", folder, &more);
+            let sim = "width = 384\nheight = 384\nfps = 4\nmotion.kind = \"still\"\n";
+            std::fs::write(folder.join("sim.toml"), sim).unwrap();
             let text = std::fs::read_to_string(&file).unwrap();
-            let text = text.replace("width = 96\nheight = 96\ntexture_px = 128", "width = 384\nheight = 384\nfps = 4");
             std::fs::write(&file, text.replace("gaussians = 3000", "gaussians = 40000")).unwrap();
             return (endpoint, None);
         }

@@ -6,10 +6,10 @@ use flyrig_tests::run;
 
 const PROGRAM: &str = env!("CARGO_BIN_EXE_flyrig-under-test");
 
-const SIM: &str = "[sim]\nseed = 511\nwidth = 256\nheight = 256\n[sim.motion]\nkind = \"walk\"\n[sim.cameras]\ncount = 4\n\
-                   [sim.calibration_error]\nrotation_deg = 1.0\ntranslation_mm = 20.0\n\
-                   [[sim.sensors]]\n[[sim.sensors]]\nexposure = 0.8\nwhite_balance = [1.2, 1.0, 0.85]\n\
-                   [[sim.sensors]]\n[[sim.sensors]]\n";
+const SIM: &str = "seed = 511\nwidth = 256\nheight = 256\n[motion]\nkind = \"walk\"\n[cameras]\ncount = 4\n\
+                   [calibration_error]\nrotation_deg = 1.0\ntranslation_mm = 20.0\n\
+                   [[sensors]]\n[[sensors]]\nexposure = 0.8\nwhite_balance = [1.2, 1.0, 0.85]\n\
+                   [[sensors]]\n[[sensors]]\n";
 
 #[test]
 fn somebody_who_walks_mends_the_calibration() {

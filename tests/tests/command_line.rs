@@ -25,6 +25,32 @@ fn the_printed_configuration_is_accepted_and_a_wrong_key_is_not() {
 }
 
 #[test]
+fn the_simulators_file_is_printed_checked_and_asked_for_by_old_configurations() {
+    let folder = tempfile::tempdir().unwrap();
+    let write = |name: &str, text: &str| std::fs::write(folder.path().join(name), text).unwrap();
+    let check = || run(PROGRAM, &["config", "check", "rig.toml"], folder.path()).unwrap();
+    let printed = run(PROGRAM, &["sim", "print"], folder.path()).unwrap();
+    assert_eq!(printed.code, Some(0));
+    write("sim.toml", &printed.stdout);
+    write("rig.toml", "[source]\npath = \"sim.toml\"\n");
+    assert_eq!(check().code, Some(0));
+    write("sim.toml", &printed.stdout.replace("texture_px", "texture_pixels"));
+    let refused = check();
+    assert_eq!(refused.code, Some(1));
+    assert!(
+        refused.stderr.contains("sim.toml") && refused.stderr.contains("did you mean `texture_px`?"),
+        "{}",
+        refused.stderr
+    );
+    write("rig.toml", "[sim]\nseed = 2\n");
+    let refused = check();
+    assert_eq!(refused.code, Some(1));
+    for part in ["line 1: [sim] is no longer read", "source.path", "flyrig sim print"] {
+        assert!(refused.stderr.contains(part), "{part}: {}", refused.stderr);
+    }
+}
+
+#[test]
 fn help_teaches() {
     let folder = tempfile::tempdir().unwrap();
     let help = run(PROGRAM, &["--help"], folder.path()).unwrap();
@@ -48,9 +74,9 @@ fn an_unknown_motion_is_answered_with_the_known_ones() {
 #[test]
 fn a_simulated_capture_is_exported_once() {
     let folder = tempfile::tempdir().unwrap();
-    let small = "[sim]\nwidth = 64\nheight = 64\ntexture_px = 64\ncameras.count = 3\n";
-    std::fs::write(folder.path().join("rig.toml"), small).unwrap();
-    let args = ["sim", "export", "rig.toml", "--out", "take", "--frames", "2"];
+    let small = "width = 64\nheight = 64\ntexture_px = 64\ncameras.count = 3\n";
+    std::fs::write(folder.path().join("sim.toml"), small).unwrap();
+    let args = ["sim", "export", "sim.toml", "--out", "take", "--frames", "2"];
     let exported = run(PROGRAM, &args, folder.path()).unwrap();
     assert_eq!(exported.code, Some(0), "{exported:?}");
     assert!(exported.stdout.contains("take: 2 frames of 3 cameras, 6 images"), "{}", exported.stdout);

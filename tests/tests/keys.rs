@@ -32,10 +32,10 @@ fn a_key_file_is_all_that_another_computer_needs() {
         assert_eq!(output.code, Some(1), "{args:?}: {output:?}");
         assert!(output.stderr.contains(part), "{args:?}: {}", output.stderr);
     };
-    let simulated = "[source]\nkind = \"sim\"\ncameras = [\"00\", \"01\"]\n\
-                     [sim]\nwidth = 64\nheight = 64\ntexture_px = 64\nfps = 10.0\ncameras.count = 2\n";
+    write("sim.toml", "width = 64\nheight = 64\ntexture_px = 64\nfps = 10.0\ncameras.count = 2\n");
+    let simulated = "[source]\nkind = \"sim\"\npath = \"sim.toml\"\ncameras = [\"00\", \"01\"]\n";
     write("cameras.toml", &format!("[rig]\nname = \"elsewhere\"\n{simulated}"));
-    done(&["sim", "export", "cameras.toml", "--out", "calibration", "--frames", "1", "--no-truth"]);
+    done(&["sim", "export", "sim.toml", "--out", "calibration", "--frames", "1", "--no-truth"]);
 
     let made = done(&["keys", "new", "stage", "--host", "127.0.0.1", "--port", &port]);
     assert!(made.stdout.trim() == "stage-keys" && made.stderr.contains("keys = \"stage-keys\""), "{made:?}");

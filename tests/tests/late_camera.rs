@@ -23,7 +23,7 @@ fn free_port() -> u16 {
 
 /// Writes a calibration, and a configuration of one camera that is not plugged in.
 fn write_rig(folder: &Path, health: u16) {
-    let sim = "[source]\ncameras = [\"00\"]\n[sim]\nwidth = 64\nheight = 64\ntexture_px = 64\ncameras.count = 1\n";
+    let sim = "width = 64\nheight = 64\ntexture_px = 64\ncameras.count = 1\n";
     std::fs::write(folder.join("sim.toml"), sim).unwrap();
     let args = ["sim", "export", "sim.toml", "--out", "calibration", "--frames", "1", "--no-truth"];
     let exported = run(PROGRAM, &args, folder).unwrap();
@@ -94,9 +94,10 @@ fn a_rig_starts_without_its_camera_and_says_so() {
 #[test]
 fn a_recording_that_breaks_off_fails_the_command_after_a_clean_end() {
     let folder = tempfile::tempdir().unwrap();
-    let config = "[source]\nkind = \"sim\"\nreal_time = false\ncameras = [\"00\", \"01\"]\n\
-        [record]\njpeg_quality = 0\nrotate = \"1MB\"\n[sim]\nwidth = 160\nheight = 160\ntexture_px = 64\nframes = 20\n\
-        cameras.count = 2\n[perception]\npose = \"given\"\nmasks = \"given\"\n\
+    let sim = "width = 160\nheight = 160\ntexture_px = 64\nframes = 20\ncameras.count = 2\n";
+    std::fs::write(folder.path().join("sim.toml"), sim).unwrap();
+    let config = "[source]\nkind = \"sim\"\npath = \"sim.toml\"\nreal_time = false\ncameras = [\"00\", \"01\"]\n\
+        [record]\njpeg_quality = 0\nrotate = \"1MB\"\n[perception]\npose = \"given\"\nmasks = \"given\"\n\
         [body]\ngaussians = 2000\nnodes = 50\n[transport]\nlisten = [\"tcp/127.0.0.1:0\"]\n";
     std::fs::write(folder.path().join("rig.toml"), config).unwrap();
     let command = |args: &[&str]| run(PROGRAM, args, folder.path()).unwrap();

@@ -16,15 +16,15 @@ fn cameras_of_another_process_are_recorded_in_whole_sets() {
     let port = TcpListener::bind("127.0.0.1:0").unwrap().local_addr().unwrap().port();
     let write = |name: &str, text: String| std::fs::write(folder.path().join(name), text).unwrap();
     let command = |args: &[&str]| run(PROGRAM, args, folder.path()).unwrap();
+    write("sim.toml", "width = 64\nheight = 64\ntexture_px = 64\nfps = 10.0\ncameras.count = 2\n".to_owned());
     write(
         "cameras.toml",
         format!(
-            "[rig]\nname = \"stage\"\n[source]\nkind = \"sim\"\ncameras = [\"00\", \"01\"]\n\
-             [sim]\nwidth = 64\nheight = 64\ntexture_px = 64\nfps = 10.0\ncameras.count = 2\n\
+            "[rig]\nname = \"stage\"\n[source]\nkind = \"sim\"\npath = \"sim.toml\"\ncameras = [\"00\", \"01\"]\n\
              [transport]\nlisten = [\"tcp/127.0.0.1:{port}\"]\n"
         ),
     );
-    let exported = command(&["sim", "export", "cameras.toml", "--out", "calibration", "--frames", "1", "--no-truth"]);
+    let exported = command(&["sim", "export", "sim.toml", "--out", "calibration", "--frames", "1", "--no-truth"]);
     assert_eq!(exported.code, Some(0), "{exported:?}");
     let rig = |name: &str| {
         format!(

@@ -10,14 +10,15 @@ use flyrig_tests::run;
 
 const PROGRAM: &str = env!("CARGO_BIN_EXE_flyrig-under-test");
 
-const RIG: &str = "[source]\nkind = \"sim\"\nreal_time = false\ncameras = []\n\
-    [sim]\nwidth = 256\nheight = 256\ntexture_px = 128\nfps = 10.0\nframes = 22\ncameras.count = 3\n\
+const SIM: &str = "width = 256\nheight = 256\ntexture_px = 128\nfps = 10.0\nframes = 22\ncameras.count = 3\n";
+const RIG: &str = "[source]\nkind = \"sim\"\npath = \"sim.toml\"\nreal_time = false\ncameras = []\n\
     [body]\ngaussians = 2000\nnodes = 50\n[output]\nwidth = 96\nheight = 96\n\
     [transport]\nlisten = [\"tcp/127.0.0.1:0\"]\n";
 
 #[test]
 fn a_rig_measures_whoever_comes_and_then_follows_the_person() {
     let folder = tempfile::tempdir().unwrap();
+    std::fs::write(folder.path().join("sim.toml"), SIM).unwrap();
     // A place is left free: nobody is in it.
     std::fs::write(folder.path().join("rig.toml"), format!("{RIG}[perception]\npeople = 2\n")).unwrap();
     let ran = run(PROGRAM, &["run", "rig.toml"], folder.path()).unwrap();
@@ -35,7 +36,8 @@ fn a_rig_measures_whoever_comes_and_then_follows_the_person() {
 #[test]
 fn a_signal_has_everybody_measured_again() {
     let folder = tempfile::tempdir().unwrap();
-    std::fs::write(folder.path().join("rig.toml"), RIG.replace("frames = 22", "frames = 70")).unwrap();
+    std::fs::write(folder.path().join("rig.toml"), RIG).unwrap();
+    std::fs::write(folder.path().join("sim.toml"), SIM.replace("frames = 22", "frames = 70")).unwrap();
     let mut rig = Command::new(PROGRAM)
         .args(["run", "rig.toml"])
         .current_dir(folder.path())
@@ -61,9 +63,9 @@ fn a_signal_has_everybody_measured_again() {
 #[test]
 fn one_camera_measures_people_by_the_floor_or_takes_a_known_or_average_height() {
     let folder = tempfile::tempdir().unwrap();
-    std::fs::write(folder.path().join("rig.toml"), RIG).unwrap();
+    std::fs::write(folder.path().join("sim.toml"), SIM).unwrap();
     let command = |args: &[&str]| run(PROGRAM, args, folder.path()).unwrap();
-    let exported = command(&["sim", "export", "rig.toml", "--out", "take", "--frames", "3", "--no-truth"]);
+    let exported = command(&["sim", "export", "sim.toml", "--out", "take", "--frames", "3", "--no-truth"]);
     assert_eq!(exported.code, Some(0), "{exported:?}");
     let eval = |more: &[&str]| {
         let mut args = vec!["eval", "take", "--inputs", "00", "--holdout", "01", "--fps", "10", "--out", "eval"];
@@ -103,10 +105,10 @@ fn one_camera_measures_people_by_the_floor_or_takes_a_known_or_average_height() 
 #[test]
 fn hands_and_face_are_found_in_images_alone() {
     let folder = tempfile::tempdir().unwrap();
-    let rig = RIG.replace("width = 256\nheight = 256", "width = 640\nheight = 640\nperson.fingers = true");
-    std::fs::write(folder.path().join("rig.toml"), rig).unwrap();
+    let sim = SIM.replace("width = 256\nheight = 256", "width = 640\nheight = 640\nperson.fingers = true");
+    std::fs::write(folder.path().join("sim.toml"), sim).unwrap();
     let command = |args: &[&str]| run(PROGRAM, args, folder.path()).unwrap();
-    let exported = command(&["sim", "export", "rig.toml", "--out", "take", "--frames", "4", "--no-truth"]);
+    let exported = command(&["sim", "export", "sim.toml", "--out", "take", "--frames", "4", "--no-truth"]);
     assert_eq!(exported.code, Some(0), "{exported:?}");
     let eval = |pose: &str| {
         let mut args = vec!["eval", "take", "--inputs", "00,01", "--holdout", "02", "--fps", "10", "--out", "eval"];
@@ -134,11 +136,9 @@ fn shoes_and_a_skirt_are_found_and_drawn_and_trousers_are_no_skirt() {
     let folder = tempfile::tempdir().unwrap();
     let command = |args: &[&str]| run(PROGRAM, args, folder.path()).unwrap();
     let take = |seed: u32| {
-        let rig = RIG
-            .replace("[sim]\n", &format!("[sim]\nseed = {seed}\n"))
-            .replace("cameras.count = 3", "cameras.count = 4");
-        std::fs::write(folder.path().join("rig.toml"), rig).unwrap();
-        let exported = command(&["sim", "export", "rig.toml", "--out", &format!("take{seed}"), "--frames", "8"]);
+        let sim = format!("seed = {seed}\n{}", SIM.replace("cameras.count = 3", "cameras.count = 4"));
+        std::fs::write(folder.path().join("sim.toml"), sim).unwrap();
+        let exported = command(&["sim", "export", "sim.toml", "--out", &format!("take{seed}"), "--frames", "8"]);
         assert_eq!(exported.code, Some(0), "{exported:?}");
     };
     let eval = |seed: u32, given_or_estimated: &str| {

@@ -9,9 +9,9 @@ const PROGRAM: &str = env!("CARGO_BIN_EXE_flyrig-under-test");
 fn a_rig_resumes_the_person_that_it_saved() {
     let folder = tempfile::tempdir().unwrap();
     support::small_rig("memory", folder.path(), "");
+    std::fs::write(folder.path().join("sim.toml"), format!("{}frames = 6\n", support::SMALL_SIM)).unwrap();
     let path = folder.path().join("rig.toml");
     let config = std::fs::read_to_string(&path).unwrap();
-    let config = config.replace("texture_px = 128\n", "texture_px = 128\nframes = 6\n");
     let config = config.replace("nodes = 100\n", "nodes = 100\nperson = \"me.person\"\n");
     std::fs::write(&path, config.replace("[source]\n", "[source]\nreal_time = false\n")).unwrap();
 

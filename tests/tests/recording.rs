@@ -5,14 +5,16 @@ use flyrig_tests::run;
 
 const PROGRAM: &str = env!("CARGO_BIN_EXE_flyrig-under-test");
 
-const RIG: &str = "[source]\nkind = \"sim\"\nreal_time = false\ncameras = [\"00\", \"01\"]\n\
+const RIG: &str = "[source]\nkind = \"sim\"\npath = \"sim.toml\"\nreal_time = false\ncameras = [\"00\", \"01\"]\n\
     [perception]\npose = \"given\"\nmasks = \"given\"\n\
-    [record]\njpeg_quality = 0\n[sim]\nwidth = 64\nheight = 64\ntexture_px = 64\nframes = 6\ncameras.count = 2\n";
+    [record]\njpeg_quality = 0\n";
+const SIM: &str = "width = 64\nheight = 64\ntexture_px = 64\nframes = 6\ncameras.count = 2\n";
 
 #[test]
 fn a_recording_is_replayed_to_the_bit_and_exported() {
     let folder = tempfile::tempdir().unwrap();
     std::fs::write(folder.path().join("rig.toml"), RIG).unwrap();
+    std::fs::write(folder.path().join("sim.toml"), SIM).unwrap();
     let command = |args: &[&str]| run(PROGRAM, args, folder.path()).unwrap();
     let recorded = command(&["record", "rig.toml", "--out", "take.mcap"]);
     assert_eq!(recorded.code, Some(0), "{recorded:?}");
@@ -46,6 +48,7 @@ fn a_recording_is_replayed_to_the_bit_and_exported() {
 #[test]
 fn images_are_recorded_as_jpeg_unless_told_otherwise_and_poses_beside_them() {
     let folder = tempfile::tempdir().unwrap();
+    std::fs::write(folder.path().join("sim.toml"), SIM).unwrap();
     let rig = RIG.replace("jpeg_quality = 0", "jpeg_quality = 95");
     std::fs::write(
         folder.path().join("rig.toml"),

@@ -9,7 +9,7 @@ use flyrig_gpu::{AdapterChoice, GpuContext};
 use flyrig_stream::Posed;
 use flyrig_transport::{Interests, Subscriber, TransportConfig, Views};
 use flyrig_viewer::{PeopleScene, Receiver, clock_secs};
-use support::{PATIENCE, Process, small_rig, wait_until};
+use support::{PATIENCE, Process, SMALL_SIM, small_rig, wait_until};
 
 const PROGRAM: &str = env!("CARGO_BIN_EXE_flyrig-under-test");
 
@@ -40,7 +40,8 @@ fn view(receiver: &Receiver, gpu: &GpuContext, camera: &flyrig_types::Camera) ->
 fn a_viewer_draws_the_person_as_the_rig_does_live_and_from_a_recording() {
     let folder = tempfile::tempdir().unwrap();
     // Standing still, so that frames of different times look alike.
-    let endpoint = small_rig("stream", folder.path(), "[sim.motion]\nkind = \"still\"\n");
+    let endpoint = small_rig("stream", folder.path(), "");
+    std::fs::write(folder.path().join("sim.toml"), format!("{SMALL_SIM}motion.kind = \"still\"\n")).unwrap();
     let gpu = GpuContext::new(&AdapterChoice::Best).unwrap();
 
     // The viewer comes first.

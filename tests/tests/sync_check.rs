@@ -5,10 +5,11 @@ use flyrig_tests::run;
 
 const PROGRAM: &str = env!("CARGO_BIN_EXE_flyrig-under-test");
 
-const RIG: &str = "[source]\nkind = \"sim\"\nreal_time = false\ncameras = []\n\
-    [perception]\npose = \"given\"\nmasks = \"given\"\n\
-    [sim]\nwidth = 112\nheight = 112\ntexture_px = 64\nframes = 75\ncameras.count = 3\nmotion.kind = \"jump\"\n\
-    [[sim.faults.fault]]\nkind = \"offset\"\ncamera = \"02\"\nms = 45.0\n";
+const RIG: &str = "[source]\nkind = \"sim\"\npath = \"sim.toml\"\nreal_time = false\ncameras = []\n\
+    [perception]\npose = \"given\"\nmasks = \"given\"\n";
+const SIM: &str =
+    "width = 112\nheight = 112\ntexture_px = 64\nframes = 75\ncameras.count = 3\nmotion.kind = \"jump\"\n";
+const FAULT: &str = "[[faults.fault]]\nkind = \"offset\"\ncamera = \"02\"\nms = 45.0\n";
 
 /// Lags in milliseconds by camera as a report tells them.
 fn lags(report: &str) -> Vec<(String, f64)> {
@@ -23,6 +24,7 @@ fn lags(report: &str) -> Vec<(String, f64)> {
 #[test]
 fn a_lag_is_found_and_taken_off() {
     let folder = tempfile::tempdir().unwrap();
+    std::fs::write(folder.path().join("sim.toml"), format!("{SIM}{FAULT}")).unwrap();
     let command = |args: &[&str]| run(PROGRAM, args, folder.path()).unwrap();
     let check = |tail: &str, truth: [f64; 3]| {
         std::fs::write(folder.path().join("rig.toml"), format!("{RIG}{tail}")).unwrap();
@@ -49,10 +51,10 @@ fn the_calibrations_time_offset_is_applied_and_can_be_replaced() {
     let folder = tempfile::tempdir().unwrap();
     let command = |args: &[&str]| run(PROGRAM, args, folder.path()).unwrap();
     std::fs::write(folder.path().join("rig.toml"), RIG).unwrap();
+    std::fs::write(folder.path().join("sim.toml"), format!("{SIM}{FAULT}")).unwrap();
     let exported = command(&["record", "rig.toml", "--out", "take.mcap", "--seconds", "60"]);
     assert_eq!(exported.code, Some(0), "{exported:?}");
-    let sim = RIG.split_once("[sim]").unwrap().1;
-    std::fs::write(folder.path().join("sim.toml"), format!("[sim]{}", sim.split_once("[[").unwrap().0)).unwrap();
+    std::fs::write(folder.path().join("sim.toml"), SIM).unwrap();
     let frames = command(&["sim", "export", "sim.toml", "--out", "room", "--frames", "1"]);
     assert_eq!(frames.code, Some(0), "{frames:?}");
     let converted = command(&["calibrate", "convert", "room", "--out", "late"]);

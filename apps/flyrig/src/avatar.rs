@@ -1,6 +1,5 @@
 //! `flyrig avatar`: personal avatars.
 
-pub mod arguments;
 mod build;
 mod checkpoint;
 mod edit;
@@ -9,17 +8,37 @@ mod export;
 mod parts;
 mod render;
 
-use std::path::Path;
+use std::path::{Path, PathBuf};
 
 use anyhow::Result;
+use clap::Subcommand;
 use flyrig_avatar::Avatar;
 use flyrig_body::Template;
 use flyrig_fusion::{AppearanceOptions, BodySettings, BudgetSettings, SessionSettings};
 use flyrig_gpu::GpuContext;
 use flyrig_report::{Replay, ReplaySettings};
 
-use crate::recording;
-use arguments::{AvatarAction, TakeArgs};
+use crate::{arguments::DatasetArgs, recording};
+
+/// Subcommands of `flyrig avatar`.
+#[derive(Debug, Subcommand)]
+pub enum AvatarAction {
+    /// Build the avatar of a person from a take: the person is tracked as live, then the avatar is fitted to all images together.
+    Build(build::AvatarBuildArgs),
+    /// Drive an avatar by the poses of a take, render the held-out cameras and score them.
+    Eval(eval::AvatarEvalArgs),
+    /// Drive an avatar by a recorded motion and write images.
+    Render(render::AvatarRenderArgs),
+    /// Change the colours of an avatar by a painted texture, or its shape.
+    Edit(edit::AvatarEditArgs),
+    /// Write an avatar for other programs: splats in a pose (PLY, glTF), a textured mesh with bones (glTF), the texture (PNG).
+    Export(export::AvatarExportArgs),
+    /// Print the provenance and size of an avatar.
+    Info {
+        /// The avatar (*.flyavatar).
+        avatar: PathBuf,
+    },
+}
 
 /// Runs the command.
 pub fn avatar(action: &AvatarAction, gpu: &dyn Fn() -> Result<GpuContext>) -> Result<()> {
@@ -65,7 +84,7 @@ fn print_far(share: f64) {
 ///
 /// With a known body an estimated pose moves that one.
 fn open_replay(
-    take: &TakeArgs,
+    take: &DatasetArgs,
     holdout: &[String],
     (body, known): (&BodySettings, Option<&Template>),
     gpu: &GpuContext,
@@ -82,8 +101,8 @@ fn open_replay(
             appearance: AppearanceOptions::default(),
             budget: BudgetSettings::default(),
         },
-        fps: take.fps,
-        frames: take.frames.clone(),
+        fps: take.rate.fps,
+        frames: take.range.frames.clone(),
         lags_nanos: take.lags.nanos(),
         true_masks: false,
         true_joints: Vec::new(),

@@ -14,9 +14,27 @@ mod views;
 use std::path::Path;
 
 use anyhow::{Result, bail};
+use clap::Subcommand;
 use flyrig_gpu::GpuContext;
 
-use crate::cli::CalibrateAction;
+/// Subcommands of `flyrig calibrate`.
+#[derive(Debug, Subcommand)]
+pub enum CalibrateAction {
+    /// Write a printable board (SVG, PDF) and its description, board.toml.
+    Board(board::CalibrateBoardArgs),
+    /// Calibrate the lens of each camera from a take with many poses of the board.
+    Lens(lens::CalibrateLensArgs),
+    /// Calibrate poses and time offsets of all cameras from a take in which they see the board together.
+    Rig(rig::CalibrateRigArgs),
+    /// Calibrate lenses and poses while the board is shown, with instructions in the terminal and on a local page.
+    Live(live::CalibrateLiveArgs),
+    /// Refine poses and time offsets of calibrated cameras from the motion of one person.
+    Person(person::CalibratePersonArgs),
+    /// Match the colours of calibrated cameras (exposure, white balance, response, vignetting) from people in view.
+    Color(color::CalibrateColorArgs),
+    /// Convert a calibration from or to the format of another program.
+    Convert(convert::CalibrateConvertArgs),
+}
 
 /// Files of a calibrated rig.
 const FILES: [&str; 2] = ["calibration.toml", "calibration.json"];

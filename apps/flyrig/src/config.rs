@@ -2,7 +2,7 @@
 
 use std::path::{Path, PathBuf};
 
-use anyhow::{Context, Result, bail, ensure};
+use anyhow::{Context, Result, anyhow, ensure};
 use flyrig_capture::Rotation;
 use flyrig_fusion::{
     AppearanceOptions, BodySettings, BudgetSettings, Origin, OutputSettings, PerceptionSettings, SessionSettings,
@@ -14,13 +14,28 @@ use flyrig_transport::TransportConfig;
 use flyrig_web::WebConfig;
 use serde::{Deserialize, Serialize};
 
-use crate::cameras::CameraEntry;
+use crate::{cameras::CameraEntry, simulator_file, toml_errors::explain};
 
-/// The commented default file, as `flyrig config print` writes it. A test keeps it equal to `Config::default()`.
+/// Commented default file, as `flyrig config print` writes it; a test keeps it equal to `Config::default()`.
 pub const DEFAULT_TOML: &str = include_str!("../assets/default.toml");
 
-/// Keys that stand in `[perception]`, but stood in `[body]` in earlier versions.
-const MOVED_FROM_BODY: [&str; 3] = ["pose", "masks", "shape"];
+/// Tables and keys of earlier versions, and what to do about each.
+const REMOVED: [(&str, &str); 10] = [
+    (
+        "sim",
+        "the simulated rig has a file of its own: move the table there, its names without `sim.` ([sim.motion] becomes [motion]), and \
+         name that file as source.path; `flyrig sim print` prints its defaults",
+    ),
+    ("body.pose", "it is a key of [perception]"),
+    ("body.masks", "it is a key of [perception]"),
+    ("body.shape", "it is a key of [perception]"),
+    ("tracking.level_of_detail", "delete it: images are compared as finely as they resolve"),
+    ("tracking.rest", "delete it: the solver rests once it has converged"),
+    ("tracking.per_view_time", "delete it: every image is explained at its own capture time"),
+    ("appearance.networks_on", "delete it: networks run on the processor"),
+    ("appearance.reuse", "delete it: networks compute every frame anew"),
+    ("transport.viewpoint_lease_millis", "delete it: a viewpoint lives for 3 s after its viewer's last request"),
+];
 
 /// Configuration of `flyrig run`; the keys are explained in `assets/default.toml`.
 #[derive(Debug, Clone, PartialEq, Default, Serialize, Deserialize)]
@@ -28,6 +43,8 @@ const MOVED_FROM_BODY: [&str; 3] = ["pose", "masks", "shape"];
 pub struct Config {
     pub rig: RigSection,
     pub source: SourceSection,
+    /// Simulated rig, from the file that `source.path` names where `source.kind` is "sim".
+    #[serde(skip)]
     pub sim: SimConfig,
     pub sync: SyncSettings,
     pub calibration: CalibrationSection,
@@ -45,14 +62,14 @@ pub struct Config {
     pub gpu: GpuSection,
 }
 
-/// How the calibration is looked after while the rig runs.
+/// Supervision of the calibration while the rig runs.
 #[derive(Debug, Clone, PartialEq, Default, Serialize, Deserialize)]
 #[serde(deny_unknown_fields, default)]
 pub struct CalibrationSection {
     pub watch: WatchMode,
 }
 
-/// Whether cameras are watched for bumps.
+/// Reaction to bumped cameras.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize)]
 #[serde(rename_all = "lowercase")]
 pub enum WatchMode {
@@ -62,6 +79,7 @@ pub enum WatchMode {
     Correct,
 }
 
+/// The table `[rig]`.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields, default)]
 pub struct RigSection {
@@ -170,7 +188,7 @@ impl Default for SourceSection {
     }
 }
 
-/// What `flyrig capture` sends.
+/// Settings of `flyrig capture`.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields, default)]
 pub struct CaptureSection {
@@ -183,7 +201,7 @@ impl Default for CaptureSection {
     }
 }
 
-/// What recordings hold.
+/// Settings of recordings.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields, default)]
 pub struct RecordSection {
@@ -197,12 +215,14 @@ impl Default for RecordSection {
     }
 }
 
+/// The table `[gpu]`.
 #[derive(Debug, Clone, PartialEq, Default, Serialize, Deserialize)]
 #[serde(deny_unknown_fields, default)]
 pub struct GpuSection {
     pub adapter: String,
 }
 
+/// The table `[health]`.
 #[derive(Debug, Clone, PartialEq, Default, Serialize, Deserialize)]
 #[serde(deny_unknown_fields, default)]
 pub struct HealthSection {
@@ -210,51 +230,56 @@ pub struct HealthSection {
 }
 
 impl Config {
-    /// Reads and checks a file.
+    /// Reads and checks a file, and the simulator's file that it names.
+    ///
+    /// # Errors
+    /// Names the file, the key, its value and what is expected.
     pub fn load(path: &Path) -> Result<Self> {
-        let text = std::fs::read_to_string(path)
-            .with_context(|| format!("cannot read the configuration {}", path.display()))?;
-        Self::parse(&text).with_context(|| format!("in the configuration {}", path.display()))
+        let config = Self::load_for_capture(path)?;
+        config.check_scene().with_context(|| in_file(path))?;
+        Ok(config)
     }
 
-    /// Reads and checks a text.
+    /// Reads and checks a file for `flyrig capture`, which needs neither a calibration nor a person.
+    ///
+    /// # Errors
+    /// Those of [`Self::load`].
+    pub fn load_for_capture(path: &Path) -> Result<Self> {
+        let text = std::fs::read_to_string(path)
+            .with_context(|| format!("cannot read the configuration {}", path.display()))?;
+        let mut config = Self::parse_values(&text).with_context(|| in_file(path))?;
+        if config.source.kind != SourceKind::Cameras {
+            config.check_scene().with_context(|| in_file(path))?;
+        }
+        if let Some(file) = config.simulator_file() {
+            config.sim = simulator_file::load(file)?;
+        }
+        Ok(config)
+    }
+
+    /// Reads and checks a text, without the simulator's file that it may name.
+    ///
+    /// # Errors
+    /// Names the key, its value and what is expected.
     pub fn parse(text: &str) -> Result<Self> {
         let config = Self::parse_values(text)?;
         config.check_scene()?;
         Ok(config)
     }
 
-    /// Reads a file for `flyrig capture`, which needs neither a calibration nor a person.
-    pub fn load_for_capture(path: &Path) -> Result<Self> {
-        let text = std::fs::read_to_string(path)
-            .with_context(|| format!("cannot read the configuration {}", path.display()))?;
-        let in_file = || format!("in the configuration {}", path.display());
-        let config = Self::parse_values(&text).with_context(in_file)?;
-        if config.source.kind != SourceKind::Cameras {
-            config.check_scene().with_context(in_file)?;
-        }
+    fn parse_values(text: &str) -> Result<Self> {
+        let config: Self = toml::from_str(text).map_err(|error| match removed_key(text, &error) {
+            Some(advice) => anyhow!(advice),
+            None => explain(&error, &toml::Table::try_from(Self::default()).unwrap_or_default()),
+        })?;
+        config.check_values()?;
         Ok(config)
     }
 
-    fn parse_values(text: &str) -> Result<Self> {
-        match toml::from_str::<Self>(text) {
-            Ok(config) => {
-                config.check_values()?;
-                Ok(config)
-            }
-            Err(error) => {
-                let hint = match error.message() {
-                    // Where these keys stood before.
-                    message
-                        if MOVED_FROM_BODY.iter().any(|key| message.starts_with(&format!("unknown field `{key}`"))) =>
-                    {
-                        "pose, masks and shape are keys of [perception]".to_owned()
-                    }
-                    message => nearest_key(message).map(|key| format!("did you mean `{key}`?")).unwrap_or_default(),
-                };
-                bail!("{}{hint}", error.to_string().trim_end_matches(' '))
-            }
-        }
+    /// Returns the simulator's file; `None` for its defaults and for other sources.
+    fn simulator_file(&self) -> Option<&Path> {
+        Some(self.source.path.as_path())
+            .filter(|path| self.source.kind == SourceKind::Sim && !path.as_os_str().is_empty())
     }
 
     fn check_values(&self) -> Result<()> {
@@ -272,7 +297,10 @@ impl Config {
         );
         range("source.fps", self.source.fps, 0.1, 1000.0)?;
         self.source.check()?;
-        self.sim.validate().context("in [sim]")?;
+        ensure!(
+            !self.appearance.mode.is_ablation(),
+            "appearance.mode is an ablation, which `flyrig-bench appearance` measures; it must be \"direct\" or \"stfa\""
+        );
         self.session().validate()?;
         self.output.validate()?;
         ensure!(
@@ -285,7 +313,7 @@ impl Config {
         self.transport().validate().context("in [rig] or [transport]")
     }
 
-    /// The settings of a session.
+    /// Returns the settings of a session.
     pub fn session(&self) -> SessionSettings {
         SessionSettings {
             perception: self.perception.clone(),
@@ -296,12 +324,15 @@ impl Config {
         }
     }
 
-    /// The settings of the transport session.
+    /// Returns the settings of the transport session.
     pub fn transport(&self) -> TransportConfig {
         TransportConfig { rig: self.rig.name.clone(), ..self.transport.clone() }
     }
 
-    /// What tracking needs beyond values in their ranges.
+    /// Checks the requirements of tracking beyond the ranges of the values.
+    ///
+    /// # Errors
+    /// Names the missing key and what to do.
     pub fn check_scene(&self) -> Result<()> {
         ensure!(
             self.source.kind == SourceKind::Sim
@@ -327,49 +358,45 @@ impl Config {
     }
 }
 
-/// Returns the key closest to `x` in a message "unknown field `x`, expected one of `a`, `b`": among the listed ones, else among all.
-fn nearest_key(message: &str) -> Option<String> {
-    let mut quoted = message.split('`').skip(1).step_by(2);
-    let unknown = quoted.next().filter(|_| message.starts_with("unknown"))?;
-    let likeness = |key: &str| strsim::jaro_winkler(unknown, key);
-    if let Some(listed) = quoted.max_by(|a, b| likeness(a).total_cmp(&likeness(b))) {
-        return Some(listed.to_owned());
-    }
-    // Tables that hold the settings of another crate list no keys.
-    let tables = toml::Table::try_from(Config::default()).ok()?;
-    let keys = tables.values().filter_map(toml::Value::as_table).flat_map(toml::Table::keys);
-    keys.max_by(|a, b| likeness(a).total_cmp(&likeness(b))).cloned()
+fn in_file(path: &Path) -> String {
+    format!("in the configuration {}", path.display())
+}
+
+/// Says what to do about a key of an earlier version that made the text invalid.
+fn removed_key(text: &str, error: &toml::de::Error) -> Option<String> {
+    let table: toml::Table = text.parse().ok()?;
+    let is_in = |path: &str| {
+        let (first, rest) = path.split_once('.').unwrap_or((path, ""));
+        let found = table.get(first);
+        if rest.is_empty() { found.is_some() } else { found.and_then(|value| value.get(rest)).is_some() }
+    };
+    let is_named = |path: &str| {
+        let key = path.rsplit('.').next().unwrap_or(path);
+        error.message().starts_with(&format!("unknown field `{key}`"))
+    };
+    let (path, advice) = REMOVED.iter().find(|(path, _)| is_named(path) && is_in(path))?;
+    let line = error.span().map_or(0, |span| text.get(..span.start).unwrap_or_default().matches('\n').count() + 1);
+    let name = if path.contains('.') { (*path).to_owned() } else { format!("[{path}]") };
+    Some(format!("line {line}: {name} is no longer read: {advice}"))
 }
 
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::toml_errors::missing_keys;
 
     #[test]
     fn the_printed_default_is_the_default() {
         assert_eq!(Config::parse(DEFAULT_TOML).unwrap(), Config::default());
         assert_eq!(Config::parse("").unwrap(), Config::default());
-        // Every key is in it, so that nobody has to guess.
-        fn missing(all: &toml::Table, printed: &toml::Table, path: &str) -> Vec<String> {
-            let of = |(key, value): (&String, &toml::Value)| match (value, printed.get(key)) {
-                // Lists are empty at first: tables to copy stand there as comments.
-                (toml::Value::Array(list), None) if list.is_empty() => Vec::new(),
-                (_, None) => vec![format!("{path}{key}")],
-                (toml::Value::Table(all), Some(toml::Value::Table(printed))) => {
-                    missing(all, printed, &format!("{path}{key}."))
-                }
-                _ => Vec::new(),
-            };
-            all.iter().flat_map(of).collect()
-        }
         let all = toml::Table::try_from(Config::default()).unwrap();
-        // It stands there as a comment, since it would exclude tables of real cameras.
+        // A comment in the file: the key would exclude tables of real cameras.
         let names = "# cameras = [\"00\", \"03\", \"05\"]\n";
-        assert_eq!(missing(&all, &DEFAULT_TOML.parse().unwrap(), ""), ["source.cameras"]);
+        assert_eq!(missing_keys(&all, &DEFAULT_TOML.parse().unwrap(), ""), ["source.cameras"]);
         let uncommented = DEFAULT_TOML.replace(names, &names[2..]);
         assert_ne!(uncommented, DEFAULT_TOML);
         assert_eq!(Config::parse(&uncommented).unwrap(), Config::default());
-        assert_eq!(missing(&all, &uncommented.parse().unwrap(), ""), Vec::<String>::new());
+        assert_eq!(missing_keys(&all, &uncommented.parse().unwrap(), ""), Vec::<String>::new());
     }
 
     #[test]
@@ -398,7 +425,9 @@ mod tests {
     fn values_out_of_range_are_named() {
         for (text, expected) in [
             ("[sync]\nwindow_ms = nan\n", "sync.window_ms is NaN"),
-            ("[body]\npose = \"given\"\n", "pose, masks and shape are keys of [perception]"),
+            ("[body]\npose = \"given\"\n", "line 2: body.pose is no longer read: it is a key of [perception]"),
+            ("[tracking]\nrest = 0.0\n", "line 2: tracking.rest is no longer read: delete it"),
+            ("[appearance]\nmode = \"direct-no-time\"\n", "appearance.mode is an ablation"),
             ("[perception]\nheight_m = 9.0\n", "perception.height_m is 9, it must lie between 0.5 and 2.5"),
             ("[body]\ngaussians = 3\n", "body.gaussians is 3, it must lie between 100 and 2000000"),
             ("[body]\ngaussians = 200\nnodes = 1000\n", "body.nodes is 1000, more than body.gaussians"),
@@ -413,10 +442,33 @@ mod tests {
                 "viewpoint_pixels_per_second: is 1000000000000, at most",
             ),
             ("[record]\nrotate = \"4\"\n", "without a unit"),
-            ("[sim]\nwidth = -4\n", "invalid value: integer `-4`"),
         ] {
             let error = format!("{:#}", Config::parse(text).unwrap_err());
             assert!(error.contains(expected), "{text}: {error}");
         }
+    }
+
+    #[test]
+    fn a_table_of_the_simulated_rig_is_answered_with_its_new_place() {
+        for text in ["[rig]\n[sim]\nwidth = 64\n", "[rig]\n[sim.motion]\nkind = \"walk\"\n", "\n[[sim.sensors]]\n"] {
+            let error = format!("{:#}", Config::parse(text).unwrap_err());
+            assert!(error.starts_with("line 2: [sim] is no longer read"), "{error}");
+            assert!(error.contains("source.path") && error.contains("flyrig sim print"), "{error}");
+        }
+        // A key of another table with the name of a removed one is only unknown.
+        let error = Config::parse("[sync]\nrest = 1\n").unwrap_err().to_string();
+        assert!(error.contains("unknown field `rest`") && !error.contains("no longer"), "{error}");
+    }
+
+    #[test]
+    fn the_simulators_file_is_read_and_checked_with_the_configuration() {
+        let folder = tempfile::tempdir().unwrap();
+        let (rig, sim) = (folder.path().join("rig.toml"), folder.path().join("sim.toml"));
+        std::fs::write(&rig, format!("[source]\npath = {:?}\n", sim.display().to_string())).unwrap();
+        std::fs::write(&sim, "width = 64\n[motion]\nkind = \"walk\"\n").unwrap();
+        assert_eq!(Config::load(&rig).unwrap().sim.width, 64);
+        std::fs::write(&sim, "width = -4\n").unwrap();
+        let error = format!("{:#}", Config::load(&rig).unwrap_err());
+        assert!(error.contains("sim.toml") && error.contains("invalid value: integer `-4`"), "{error}");
     }
 }

@@ -1,23 +1,29 @@
 //! `flyrig demo`: the whole system on a simulated rig, with a viewer in a process of its own and a report.
 
 use std::{
-    path::Path,
+    net::SocketAddr,
+    path::{Path, PathBuf},
     process::{Child, Command},
     sync::{Arc, Mutex, MutexGuard},
     time::{Duration, Instant},
 };
 
 use anyhow::{Context, Result, anyhow, bail, ensure};
+use clap::Args;
 use flyrig_body::{ShapeParams, default_template};
 use flyrig_capture::{CameraSource, Pacing};
 use flyrig_fusion::{
-    AppearanceMode, AppearanceOptions, BodySettings, EstimatedPerception, GivenPerception, InputFormat, Intake,
-    LivePublisher, LiveRig, LiveViews, Origin, OutputSettings, SHAPE_SECS, SHAPE_SETS, Session, SessionBuilder,
-    SessionSettings, StageSummary, resident_mib,
+    AppearanceMode, AppearanceOptions, BodySettings, BudgetSettings, EstimatedPerception, GivenPerception, InputFormat,
+    Intake, LivePublisher, LiveRig, LiveViews, Origin, OutputSettings, PerceptionSettings, SHAPE_SECS, SHAPE_SETS,
+    Session, SessionBuilder, SessionSettings, StageSummary, TrackingSettings, resident_mib,
 };
 use flyrig_gpu::GpuContext;
 use flyrig_metrics::{CameraScore, ScoreSheet, score_view};
-use flyrig_report::{ContactRow, Curve, Report, contact_images, dataset, png, progress_bar, stop, write_whole};
+use flyrig_report::{
+    ContactRow, Curve, Report,
+    arguments::{GaussiansArgs, OutputArgs, parse_minutes},
+    contact_images, dataset, png, progress_bar, stop, write_whole,
+};
 use flyrig_sim::{FaultScript, MotionConfig, MotionKind, SimConfig, SimFrame, SimTime, Simulator};
 use flyrig_sync::SyncSettings;
 use flyrig_transport::{Publisher, TransportConfig};
@@ -25,7 +31,59 @@ use flyrig_types::{Camera, Frame, FrameSet, Rig};
 use indicatif::ProgressBar;
 use serde::{Deserialize as _, Serialize, de::IntoDeserializer as _};
 
-use crate::{cli::DemoArgs, source::simulated_plates, watch::WatchStats};
+use crate::{source::simulated_plates, watch::WatchStats};
+
+/// Arguments of `flyrig demo`.
+#[derive(Debug, Args)]
+#[command(mut_arg("out", |arg| arg.default_value("out/demo")))]
+pub struct DemoArgs {
+    /// Number of frames.
+    #[arg(long, default_value_t = 60, conflicts_with = "minutes")]
+    pub frames: usize,
+    /// Duration in minutes instead of frames; the motion repeats.
+    #[arg(long, value_parser = parse_minutes)]
+    pub minutes: Option<f64>,
+    /// Seed of person and room.
+    #[arg(long, default_value_t = 1)]
+    pub seed: u64,
+    /// Motion: "turn", "walk", "wave", "squat", "reach", "sit", "lie", "jump", "cross-arms", "dance", "still", "by-seed", "bvh" (a captured
+    /// walk from Debian's assimp-testmodels), or a *.bvh, *.glb or *.gltf file.
+    #[arg(long, default_value = "turn")]
+    pub motion: String,
+    /// File with faults of cameras and clocks (TOML), such as sim/assets/faults.toml.
+    #[arg(long)]
+    pub faults: Option<PathBuf>,
+    /// Source of the pose: the images, or the simulator.
+    #[arg(long, value_enum, default_value = "estimated")]
+    pub pose: Origin,
+    /// Source of the masks: the images and the empty room, or the simulator.
+    #[arg(long, value_enum, default_value = "estimated")]
+    pub masks: Origin,
+    /// Source of the body's shape: the images, or the simulator; by default that of the pose.
+    #[arg(long, value_enum)]
+    pub shape: Option<Origin>,
+    #[command(flatten)]
+    pub tracking: TrackingSettings,
+    #[command(flatten)]
+    pub appearance: AppearanceOptions,
+    #[command(flatten)]
+    pub budget: BudgetSettings,
+    /// Address of the publisher; port 0 selects a free port.
+    #[arg(long, default_value = "127.0.0.1:0")]
+    pub listen: SocketAddr,
+    #[command(flatten)]
+    pub output: OutputArgs,
+    #[command(flatten)]
+    pub surface: GaussiansArgs,
+}
+
+impl DemoArgs {
+    /// Returns the settings of the perception.
+    pub fn perception(&self) -> PerceptionSettings {
+        let Self { pose, masks, shape, .. } = *self;
+        PerceptionSettings { pose, masks, shape, ..PerceptionSettings::default() }
+    }
+}
 
 /// Cameras that go in, and cameras that are only rendered and compared.
 const INPUTS: [&str; 3] = ["00", "03", "05"];
@@ -75,7 +133,7 @@ struct Metrics {
 
 /// Runs the command.
 pub fn demo(args: &DemoArgs, gpu: &GpuContext) -> Result<()> {
-    std::fs::create_dir_all(&args.out).with_context(|| format!("cannot create {}", args.out.display()))?;
+    args.output.create()?;
     eprintln!("demo: simulated rig drawn by {}, people by {}", gpu.adapter_name(), gpu.fastest().adapter_name());
     let simulator = Arc::new(Mutex::new(Simulator::new(gpu, &sim_config(args)?)?));
 
@@ -85,7 +143,7 @@ pub fn demo(args: &DemoArgs, gpu: &GpuContext) -> Result<()> {
     })?;
     publisher.add_view("main")?;
     let endpoint = publisher.endpoints().first().context("the publisher listens nowhere")?.clone();
-    let viewer = Viewer::start(&args.out, &endpoint)?;
+    let viewer = Viewer::start(&args.output.out, &endpoint)?;
     let deadline = Instant::now() + VIEWER_DEADLINE;
     while !publisher.has_subscribers("main") && Instant::now() < deadline {
         std::thread::sleep(Duration::from_millis(50));
@@ -95,20 +153,12 @@ pub fn demo(args: &DemoArgs, gpu: &GpuContext) -> Result<()> {
     let main = pass(args, gpu, &simulator, &args.appearance, Some(publisher))?;
     let watch = viewer.finish();
     let main_mode = args.appearance.mode;
-    let mut modes = vec![(main_mode, main.sheet.per_camera(), main.sheet.mean())];
-    if args.ablation {
-        for mode in [AppearanceMode::Direct, AppearanceMode::DirectNoTime, AppearanceMode::DirectNoSpaceTime] {
-            if mode != main_mode && !stop::requested() {
-                let other = pass(args, gpu, &simulator, &AppearanceOptions::of_mode(mode), None)?;
-                modes.push((mode, other.sheet.per_camera(), other.sheet.mean()));
-            }
-        }
-    }
+    let modes = vec![(main_mode, main.sheet.per_camera(), main.sheet.mean())];
 
     let metrics = Metrics {
         adapter: gpu.fastest().adapter_name(),
         seed: args.seed,
-        gaussians: args.gaussians,
+        gaussians: args.surface.gaussians,
         frames: main.frames,
         seconds: main.seconds,
         frames_per_second: main.frames as f64 / (main.seconds - main.scoring_seconds).max(1e-9),
@@ -118,9 +168,9 @@ pub fn demo(args: &DemoArgs, gpu: &GpuContext) -> Result<()> {
         memory_mib: main.memory.clone(),
         watch,
     };
-    write_whole(&args.out.join("metrics.json"), &serde_json::to_vec_pretty(&metrics)?)?;
+    write_whole(&args.output.out.join("metrics.json"), &serde_json::to_vec_pretty(&metrics)?)?;
     let summary = summary(&metrics);
-    let path = args.out.join("index.html");
+    let path = args.output.out.join("index.html");
     report(&metrics, main, &summary).save(&path)?;
     for (mode, scores, mean) in &metrics.modes {
         println!("\n{mode:?}: three cameras in, four held out");
@@ -135,7 +185,7 @@ pub fn demo(args: &DemoArgs, gpu: &GpuContext) -> Result<()> {
     println!(
         "\nreport: {} (open it in a browser); the viewer's images: {}",
         path.display(),
-        args.out.join("watched").display()
+        args.output.out.join("watched").display()
     );
     Ok(())
 }
@@ -195,7 +245,7 @@ fn pass(
         .collect();
     let settings = SessionSettings {
         perception: args.perception(),
-        body: BodySettings { gaussians: args.gaussians, ..BodySettings::default() },
+        body: BodySettings { gaussians: args.surface.gaussians, ..BodySettings::default() },
         tracking: args.tracking.clone(),
         appearance: appearance.clone(),
         budget: args.budget,
@@ -346,7 +396,7 @@ fn score(
 /// `flyrig watch` as a child process.
 struct Viewer {
     child: Child,
-    stats: std::path::PathBuf,
+    stats: PathBuf,
 }
 
 impl Viewer {

@@ -1,11 +1,13 @@
 //! `flyrig eval`: replay a data set in order, as live, render the cameras that were held out, score them.
 
-use std::time::Instant;
+use std::{path::PathBuf, time::Instant};
 
 use anyhow::{Context, Result, ensure};
+use clap::Args;
 use flyrig_body::write_mesh_ply;
 use flyrig_fusion::{
-    AppearanceMode, BodySettings, Counts, Origin, Outcome, PersonId, SessionSettings, Solver, StageSummary,
+    AppearanceMode, AppearanceOptions, BodySettings, BudgetSettings, Counts, Origin, Outcome, PersonId,
+    SessionSettings, Solver, StageSummary,
 };
 use flyrig_gpu::GpuContext;
 use flyrig_metrics::{CameraScore, FrameScore, ScoreSheet, error_parts, score_view};
@@ -17,7 +19,31 @@ use flyrig_types::{Camera, Frame, RenderedView};
 use rayon::prelude::*;
 use serde::Serialize;
 
-use crate::{cli::EvalArgs, recording};
+use crate::{
+    arguments::{DatasetArgs, HoldoutArgs},
+    recording,
+};
+
+/// Arguments of `flyrig eval`.
+#[derive(Debug, Args)]
+pub struct EvalArgs {
+    #[command(flatten)]
+    pub take: DatasetArgs,
+    #[command(flatten)]
+    pub holdout: HoldoutArgs,
+    /// Folder of images, surfaces and the report.
+    #[arg(long)]
+    pub out: PathBuf,
+    #[command(flatten)]
+    pub body: BodySettings,
+    /// Avatar of the person (`flyrig avatar build`), from which tracking and colours start.
+    #[arg(long, value_name = "FILE")]
+    pub avatar: Option<PathBuf>,
+    #[command(flatten)]
+    pub appearance: AppearanceOptions,
+    #[command(flatten)]
+    pub budget: BudgetSettings,
+}
 
 /// Every so many frames the tracked surface is written.
 const SURFACE_EVERY: u64 = 10;
@@ -57,20 +83,20 @@ pub fn eval(args: &EvalArgs, gpu: &GpuContext) -> Result<()> {
     let started = Instant::now();
     let body = BodySettings { avatar: args.avatar.clone().unwrap_or_default(), ..args.body.clone() };
     let settings = ReplaySettings {
-        dataset: args.dataset.clone(),
-        recorded: recording::rig_of_take(&args.dataset)?,
-        inputs: args.inputs.clone(),
-        holdout: args.holdout.clone(),
+        dataset: args.take.dataset.clone(),
+        recorded: recording::rig_of_take(&args.take.dataset)?,
+        inputs: args.take.inputs.clone(),
+        holdout: args.holdout.holdout.clone(),
         session: SessionSettings {
-            perception: args.perception.clone(),
+            perception: args.take.perception.clone(),
             body: body.clone(),
-            tracking: args.tracking.clone(),
+            tracking: args.take.tracking.clone(),
             appearance: args.appearance.clone(),
             budget: args.budget,
         },
-        fps: args.fps,
-        frames: args.frames.clone(),
-        lags_nanos: args.lags.nanos(),
+        fps: args.take.rate.fps,
+        frames: args.take.range.frames.clone(),
+        lags_nanos: args.take.lags.nanos(),
         true_masks: false,
         true_joints: Vec::new(),
         body: known_body(&body, false)?,
@@ -141,17 +167,17 @@ pub fn eval(args: &EvalArgs, gpu: &GpuContext) -> Result<()> {
         bar.inc(1);
     }
     bar.finish_and_clear();
-    ensure!(processed > 0, "no frame of {} could be used; run with -v to see why", args.dataset.display());
+    ensure!(processed > 0, "no frame of {} could be used; run with -v to see why", args.take.dataset.display());
 
     let cameras = sheet.per_camera();
     let seconds = started.elapsed().as_secs_f64();
     let metrics = Metrics {
-        dataset: args.dataset.file_name().map_or_else(String::new, |n| n.to_string_lossy().into_owned()),
-        inputs: &args.inputs,
-        holdout: &args.holdout,
-        pose: args.perception.pose,
-        masks: args.perception.masks,
-        solver: args.tracking.solver,
+        dataset: args.take.dataset.file_name().map_or_else(String::new, |n| n.to_string_lossy().into_owned()),
+        inputs: &args.take.inputs,
+        holdout: &args.holdout.holdout,
+        pose: args.take.perception.pose,
+        masks: args.take.perception.masks,
+        solver: args.take.tracking.solver,
         appearance: args.appearance.mode,
         gaussians: args.body.gaussians,
         nodes: args.body.nodes,
@@ -173,13 +199,16 @@ pub fn eval(args: &EvalArgs, gpu: &GpuContext) -> Result<()> {
         title: format!("flyrig eval: {}", metrics.dataset),
         facts: vec![
             ("adapter".to_owned(), metrics.adapter.clone()),
-            ("inputs, held out".to_owned(), format!("{} → {}", args.inputs.join(" "), args.holdout.join(" "))),
+            (
+                "inputs, held out".to_owned(),
+                format!("{} → {}", args.take.inputs.join(" "), args.holdout.holdout.join(" ")),
+            ),
             (
                 "pose, masks, deformation, appearance".to_owned(),
                 format!("{:?}, {:?}, {:?}, {:?}", metrics.pose, metrics.masks, metrics.solver, metrics.appearance),
             ),
             ("Gaussians, nodes".to_owned(), format!("{}, {}", metrics.gaussians, metrics.nodes)),
-            ("lags taken off, ms".to_owned(), listed(&args.lags.by_camera)),
+            ("lags taken off, ms".to_owned(), listed(&args.take.lags.by_camera)),
             ("frames".to_owned(), format!("{processed} in {seconds:.1} s, writing and scoring included")),
             ("scored against".to_owned(), metrics.reference.to_owned()),
         ],

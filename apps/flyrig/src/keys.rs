@@ -3,9 +3,85 @@
 use std::path::{Path, PathBuf};
 
 use anyhow::{Context as _, Result};
-use flyrig_access::{Holder, KeyFile, Ring, Role};
+use clap::{Args, Subcommand};
+use flyrig_access::{DEFAULT_PORT, Holder, KeyFile, Ring, Role};
 
-use crate::cli::{KeysAction, RingArgs};
+/// Keys of a rig.
+#[derive(Debug, Args)]
+pub struct RingArgs {
+    /// Folder of the rig's keys; the only such folder in the current one otherwise.
+    #[arg(long)]
+    pub ring: Option<PathBuf>,
+}
+
+/// Arguments of a new key.
+#[derive(Debug, Args)]
+pub struct NewKeyArgs {
+    /// Validity, days.
+    #[arg(long, default_value_t = 365)]
+    pub days: u64,
+    /// File of the key; NAME.key otherwise.
+    #[arg(long)]
+    pub out: Option<PathBuf>,
+    #[command(flatten)]
+    pub ring: RingArgs,
+}
+
+/// Subcommands of `flyrig keys`.
+#[derive(Debug, Subcommand)]
+pub enum KeysAction {
+    /// Create the folder of a rig's keys.
+    New {
+        /// Name of the rig, as rig.name in its configuration.
+        rig: String,
+        /// Name or address by which other computers reach this computer; may be repeated.
+        #[arg(long = "host", required = true, value_name = "NAME")]
+        hosts: Vec<String>,
+        /// Port for viewers; cameras of other computers use the next one.
+        #[arg(long, default_value_t = DEFAULT_PORT)]
+        port: u16,
+        /// New folder; RIG-keys otherwise.
+        #[arg(long)]
+        out: Option<PathBuf>,
+    },
+    /// Create a key: a single file, which is all that its holder needs.
+    Add {
+        /// Name of the holder.
+        name: String,
+        /// Role: "viewer" watches, "cameras" sends camera images, "relay" watches and serves other viewers.
+        #[arg(long, default_value = "viewer", value_parser = parse_role)]
+        role: Role,
+        #[command(flatten)]
+        file: NewKeyArgs,
+    },
+    /// List the holders of keys.
+    List {
+        #[command(flatten)]
+        ring: RingArgs,
+    },
+    /// Create a new key for a holder, and refuse the old one from now on.
+    Renew {
+        /// Name of the holder.
+        name: String,
+        #[command(flatten)]
+        file: NewKeyArgs,
+    },
+    /// Refuse a holder from now on; a running rig disconnects it within a second.
+    Revoke {
+        /// Name of the holder.
+        name: String,
+        #[command(flatten)]
+        ring: RingArgs,
+    },
+}
+
+fn parse_role(text: &str) -> Result<Role, String> {
+    let known = Role::ALL.map(Role::name);
+    Role::ALL
+        .into_iter()
+        .find(|role| role.name() == text)
+        .ok_or_else(|| format!("no such role; known: {}", known.join(", ")))
+}
 
 /// End of the names of folders of keys.
 const FOLDER_END: &str = "-keys";

@@ -2,6 +2,7 @@
 //!
 //! A library only so that the end-to-end tests can build the same program; its documentation is `--help`.
 
+mod arguments;
 mod avatar;
 mod calibrate;
 mod cameras;
@@ -21,10 +22,12 @@ mod run;
 mod serve;
 mod silhouettes;
 mod sim_export;
+mod simulator_file;
 mod source;
 mod stream_recording;
 mod sync_check;
 mod take;
+mod toml_errors;
 mod view;
 mod watch;
 
@@ -38,8 +41,9 @@ use flyrig_report::{
 };
 
 use crate::{
-    cli::{Cli, Command, ConfigAction, SimAction},
+    cli::{Cli, Command, ConfigAction},
     config::{Config, DEFAULT_TOML, SourceKind},
+    sim_export::SimAction,
 };
 
 /// Reads and checks a configuration; the error is what `flyrig config check` says.
@@ -48,6 +52,14 @@ use crate::{
 /// Names the key, what was found, and what is expected.
 pub fn check_config(text: &str) -> Result<(), String> {
     Config::parse(text).map(|_| ()).map_err(|error| program::one_line(&error))
+}
+
+/// Reads and checks the simulator's configuration, as `flyrig sim print` prints it.
+///
+/// # Errors
+/// Names the key, what was found, and what is expected.
+pub fn check_simulator(text: &str) -> Result<(), String> {
+    simulator_file::parse(text).map(|_| ()).map_err(|error| program::one_line(&error))
 }
 
 /// Runs the command line of this process. For the beginning of `main`, before any other thread runs.
@@ -97,9 +109,12 @@ fn dispatch(cli: &Cli) -> Result<()> {
         Command::Avatar { action } => avatar::avatar(action, &|| open_gpu(cli.adapter.as_deref())),
         Command::Eval(args) => eval::eval(args, &open_gpu(cli.adapter.as_deref())?),
         Command::Sim { action: SimAction::Export(args) } => {
-            let config = args.config.as_deref().map(Config::load).transpose()?.unwrap_or_default();
-            let adapter = cli.adapter.as_deref().or(Some(config.gpu.adapter.as_str()));
-            sim_export::sim_export(args, &config.sim, &open_gpu(adapter)?)
+            let config = args.config.as_deref().map(simulator_file::load).transpose()?.unwrap_or_default();
+            sim_export::sim_export(args, &config, &open_gpu(cli.adapter.as_deref())?)
+        }
+        Command::Sim { action: SimAction::Print } => {
+            print!("{}", simulator_file::DEFAULT_TOML);
+            Ok(())
         }
         Command::Train(args) => flyrig_training::train(args, &|| open_gpu(cli.adapter.as_deref())),
         Command::Config { action: ConfigAction::Print } => {

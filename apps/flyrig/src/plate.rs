@@ -6,16 +6,34 @@ use std::{
 };
 
 use anyhow::{Context as _, Result, bail, ensure};
+use clap::Args;
 use flyrig_capture::{CaptureThreads, Pacing, PopError, SourceOpener, ThreadsConfig, to_rgb8};
 use flyrig_gpu::GpuContext;
-use flyrig_report::{dataset, png, progress_bar, stop, write_whole};
+use flyrig_report::{
+    arguments::{FpsArgs, parse_seconds},
+    dataset, png, progress_bar, stop, write_whole,
+};
 use flyrig_tracker::{PoseNet, shows_person};
 use flyrig_types::{CameraId, Frame, Image, PixelFormat};
 
 use crate::{
-    cli::PlateArgs,
+    arguments::TargetArgs,
     take::{self, Take},
 };
+
+/// Arguments of `flyrig plate`.
+#[derive(Debug, Args)]
+pub struct PlateArgs {
+    /// A configuration (*.toml), a recording (*.mcap) or a folder with images/CAM.
+    pub input: PathBuf,
+    /// Seconds of the median of each pixel.
+    #[arg(long, default_value_t = 3.0, value_parser = parse_seconds)]
+    pub secs: f64,
+    #[command(flatten)]
+    pub rate: FpsArgs,
+    #[command(flatten)]
+    pub target: TargetArgs,
+}
 
 /// Frames of a camera that the median is taken over, spread over the time.
 const FRAMES: usize = 25;
@@ -30,11 +48,11 @@ const MOVED_PIXELS: f64 = 0.01;
 /// Runs the command. `gpu` opens a graphics adapter, for simulated cameras alone.
 pub fn plate(args: &PlateArgs, gpu: &dyn Fn() -> Result<GpuContext>) -> Result<()> {
     stop::flag();
-    let Take { sources, pacing } = take::open(std::slice::from_ref(&args.input), args.fps, gpu)?;
+    let Take { sources, pacing } = take::open(std::slice::from_ref(&args.input), args.rate.fps, gpu)?;
     let cameras: Vec<CameraId> = sources.iter().map(|source| source.camera().clone()).collect();
-    let folder = args.out.join("background");
+    let folder = args.target.out.join("background");
     let files: Vec<PathBuf> = cameras.iter().map(|camera| dataset::plate_file(&folder, camera)).collect();
-    if let Some(known) = files.iter().find(|file| file.exists()).filter(|_| !args.force) {
+    if let Some(known) = files.iter().find(|file| file.exists()).filter(|_| !args.target.force) {
         bail!("{} is there already; --force replaces it", known.display());
     }
     if pacing == Pacing::AsDelivered {
@@ -45,7 +63,7 @@ pub fn plate(args: &PlateArgs, gpu: &dyn Fn() -> Result<GpuContext>) -> Result<(
     let mut plates = Vec::new();
     for scene in scenes {
         let plate = scene.plate()?;
-        if !args.force && shows_person(&net, &plate.image)? {
+        if !args.target.force && shows_person(&net, &plate.image)? {
             bail!(
                 "camera {}: somebody stands in the image; leave the scene empty and try again, or accept it with --force",
                 scene.camera
@@ -68,7 +86,7 @@ pub fn plate(args: &PlateArgs, gpu: &dyn Fn() -> Result<GpuContext>) -> Result<(
     println!(
         "next: plates are found by themselves where source.path, or the data set of flyrig eval, is {}; else set plates = \"{}\" \
          in [perception]. Record them again after a camera, its exposure or the lights have changed.",
-        args.out.display(),
+        args.target.out.display(),
         folder.display()
     );
     Ok(())

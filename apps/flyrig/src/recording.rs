@@ -2,11 +2,12 @@
 
 use std::{
     fs,
-    path::Path,
+    path::{Path, PathBuf},
     time::{Duration, Instant},
 };
 
 use anyhow::{Context as _, Result, bail, ensure};
+use clap::Args;
 use flyrig_calib::{calibration_toml, parse_calibration, save_export};
 use flyrig_capture::{
     CameraSource, CaptureThreads, Compression, McapReplay, Note, Pacing, PopError, Recorded, Recorder, RecorderConfig,
@@ -24,11 +25,35 @@ use foxglove::{
 };
 
 use crate::{
-    cli::{RecordArgs, ReplayArgs},
+    arguments::{LagArgs, StopArgs},
     config::{Config, RecordSection, SourceKind},
     live, pose_recording,
     source::{self, Source},
 };
+
+/// Arguments of `flyrig record`.
+#[derive(Debug, Args)]
+pub struct RecordArgs {
+    /// Configuration (TOML); see `flyrig config print`.
+    pub config: PathBuf,
+    /// New MCAP file, which Foxglove and other readers open.
+    #[arg(long)]
+    pub out: PathBuf,
+    #[command(flatten)]
+    pub stop: StopArgs,
+}
+
+/// Arguments of `flyrig replay`.
+#[derive(Debug, Args)]
+pub struct ReplayArgs {
+    /// The MCAP file.
+    pub recording: PathBuf,
+    /// Write the synchronized images and the calibration into this new folder (EasyMocap layout).
+    #[arg(long)]
+    pub export: Option<PathBuf>,
+    #[command(flatten)]
+    pub lags: LagArgs,
+}
 
 /// Topics of the calibration in a recording, as on the network.
 const CALIBRATION: &str = "calibration/";
@@ -193,7 +218,7 @@ pub fn record(config: &Config, args: &RecordArgs, gpu: Option<&GpuContext>) -> R
     eprintln!("record: {} cameras to {} (Ctrl-C ends)", ids.len(), args.out.display());
     Monitor::ready();
     let (started, mut printed, mut has_ended) = (Instant::now(), Instant::now(), false);
-    let is_over = || args.seconds.is_some_and(|seconds| started.elapsed().as_secs_f64() >= seconds);
+    let is_over = || args.stop.seconds.is_some_and(|seconds| started.elapsed().as_secs_f64() >= seconds);
     while !stop.load(std::sync::atomic::Ordering::Relaxed) && !is_over() && recorder.state().problem.is_none() {
         // The frames are recorded on their way; here they are only taken out.
         match threads.queue().pop(Duration::from_millis(100)) {

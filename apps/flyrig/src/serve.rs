@@ -2,16 +2,30 @@
 
 use std::{
     net::{Ipv4Addr, TcpListener},
+    path::PathBuf,
     time::Duration,
 };
 
 use anyhow::{Context as _, Result};
+use clap::Args;
 use flyrig_fusion::check_threads;
 use flyrig_report::stop;
 use flyrig_transport::{Relay, TransportConfig};
 use flyrig_web::{WebConfig, WebServer};
 
-use crate::cli::ServeArgs;
+use crate::arguments::RigArgs;
+
+/// Arguments of `flyrig serve`.
+#[derive(Debug, Args)]
+pub struct ServeArgs {
+    #[command(flatten)]
+    pub rig: RigArgs,
+    /// Folder of the keys of this relay (`flyrig keys new RIG --host THIS-COMPUTER`), whose holders watch the rig through it with `flyrig view`.
+    #[arg(long, value_name = "FOLDER")]
+    pub keys: Option<PathBuf>,
+    #[command(flatten)]
+    pub web: WebConfig,
+}
 
 /// How often Ctrl-C is looked at.
 const TURN: Duration = Duration::from_millis(100);

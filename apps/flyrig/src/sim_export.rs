@@ -1,13 +1,37 @@
 //! `flyrig sim export`: a simulated capture as a data set.
 
-use std::time::Instant;
+use std::{path::PathBuf, time::Instant};
 
 use anyhow::Result;
+use clap::{Args, Subcommand};
 use flyrig_gpu::GpuContext;
 use flyrig_report::{progress_bar, stop};
 use flyrig_sim::{ExportOptions, SimConfig, Simulator, export};
 
-use crate::cli::SimExportArgs;
+/// Arguments of `flyrig sim export`.
+#[derive(Debug, Args)]
+pub struct SimExportArgs {
+    /// Configuration of the simulated rig (TOML), as `flyrig sim print` prints it; its defaults otherwise.
+    pub config: Option<PathBuf>,
+    /// New folder of the capture.
+    #[arg(long)]
+    pub out: PathBuf,
+    /// Number of frames of every camera.
+    #[arg(long, default_value_t = 60, value_parser = clap::value_parser!(u64).range(1..=1_000_000))]
+    pub frames: u64,
+    /// Skip the ground truth: depth, canonical positions, poses, surfaces and true times.
+    #[arg(long)]
+    pub no_truth: bool,
+}
+
+/// Subcommands of `flyrig sim`.
+#[derive(Debug, Subcommand)]
+pub enum SimAction {
+    /// Print the default configuration of the simulated rig with a comment on every key.
+    Print,
+    /// Write a simulated capture in the layout of EasyMocap, which `flyrig eval` reads, with the ground truth.
+    Export(SimExportArgs),
+}
 
 /// Runs the command.
 pub fn sim_export(args: &SimExportArgs, config: &SimConfig, gpu: &GpuContext) -> Result<()> {

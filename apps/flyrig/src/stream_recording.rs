@@ -6,21 +6,46 @@
 
 use std::{
     collections::BTreeSet,
-    path::Path,
+    path::{Path, PathBuf},
     time::{Duration, Instant},
 };
 
 use anyhow::{Context as _, Result, ensure};
+use clap::Args;
 use flyrig_capture::{MessageTap, Pacing, monotonic_nanos, recorded_messages};
-use flyrig_report::stop;
+use flyrig_report::{arguments::parse_speed, stop};
 use flyrig_stream::{Stamp, restamp, stamp_of, template_hash};
 use flyrig_transport::{Interests, PersonMessage, Publisher, Subscriber, TransportConfig};
 
-use crate::{
-    cli::{PlayArgs, WatchArgs},
-    config::RecordSection,
-    recording,
-};
+use crate::{config::RecordSection, recording, watch::WatchArgs};
+
+/// Arguments of `flyrig play`.
+#[derive(Debug, Args)]
+pub struct PlayArgs {
+    /// Recording of `flyrig watch --record`.
+    pub recording: PathBuf,
+    /// Name of the published rig.
+    #[arg(long, default_value = "flyrig")]
+    pub rig: String,
+    /// Address for viewers of this computer (zenoh endpoint).
+    #[arg(long, default_value = "tcp/127.0.0.1:7447")]
+    pub listen: String,
+    /// Folder of the rig's keys, whose holders connect from other computers.
+    #[arg(long)]
+    pub keys: Option<PathBuf>,
+    /// Allow addresses that other computers reach without keys: in trusted networks only.
+    #[arg(long)]
+    pub insecure: bool,
+    /// Repeat until Ctrl-C.
+    #[arg(long)]
+    pub repeat: bool,
+    /// Wait for the first viewer.
+    #[arg(long)]
+    pub wait: bool,
+    /// Pace relative to that of the recording.
+    #[arg(long, default_value_t = 1.0, value_parser = parse_speed)]
+    pub speed: f64,
+}
 
 const TOPIC: &str = "person-stream";
 const SCHEMA: &str = "flyrig.PersonStream";
@@ -78,7 +103,7 @@ pub fn record(args: &WatchArgs, path: &Path) -> Result<()> {
     let started = Instant::now();
     let is_over = || {
         stop.load(std::sync::atomic::Ordering::Relaxed)
-            || args.seconds.is_some_and(|limit| started.elapsed().as_secs_f64() >= limit)
+            || args.stop.seconds.is_some_and(|limit| started.elapsed().as_secs_f64() >= limit)
     };
     eprintln!(
         "watch: rig '{}' at {}, waiting for its calibration (Ctrl-C ends)",

@@ -3,6 +3,7 @@
 use std::time::{Duration, Instant};
 
 use anyhow::{Result, bail, ensure};
+use clap::Args;
 use flyrig_capture::{CaptureThreads, Pacing, PopError, SourceOpener, ThreadsConfig, to_rgb8_into};
 use flyrig_gpu::GpuContext;
 use flyrig_report::stop;
@@ -12,10 +13,25 @@ use flyrig_sync::{
 use flyrig_types::{CameraId, Image, Rig};
 
 use crate::{
-    cli::SyncCheckArgs,
+    arguments::{CalibrationArgs, InputArgs, SpanArgs, parse_most_ms},
     silhouettes::Silhouettes,
     take::{self, CalibratedTake},
 };
+
+/// Arguments of `flyrig sync-check`.
+#[derive(Debug, Args)]
+#[command(mut_arg("secs", |arg| arg.alias("seconds")))]
+pub struct SyncCheckArgs {
+    /// Largest time offset of the search, milliseconds.
+    #[arg(long, default_value_t = 250.0, value_parser = parse_most_ms)]
+    pub most_ms: f64,
+    #[command(flatten)]
+    pub source: InputArgs,
+    #[command(flatten)]
+    pub calibration: CalibrationArgs,
+    #[command(flatten)]
+    pub span: SpanArgs,
+}
 
 const ADD_TO_CAMERA: &str = "add it to the lag_ms that its [[source.cameras]] has (0 without one)";
 const ADD: &str = "add it to the camera's time_offset_ms in calibration.toml, or to [sync] lags_ms or --lag CAM=MS, which replace that";
@@ -23,7 +39,8 @@ const ADD: &str = "add it to the camera's time_offset_ms in calibration.toml, or
 /// Runs the command. `gpu` opens a graphics adapter, for simulated cameras alone.
 pub fn sync_check(args: &SyncCheckArgs, gpu: &dyn Fn() -> Result<GpuContext>) -> Result<()> {
     stop::flag();
-    let mut take = take::open_calibrated(&args.input, args.fps, args.calibration.as_deref(), gpu)?;
+    let mut take =
+        take::open_calibrated(&args.source.input, args.source.rate.fps, args.calibration.calibration.as_deref(), gpu)?;
     let cameras: Vec<CameraId> = take.sources.iter().map(|source| source.camera().clone()).collect();
     ensure!(cameras.len() > 1, "a time offset needs at least two cameras; name another one");
     let advice = if take.is_live { ADD_TO_CAMERA } else { ADD };
@@ -42,7 +59,7 @@ pub fn sync_check(args: &SyncCheckArgs, gpu: &dyn Fn() -> Result<GpuContext>) ->
                  tells no lag; record the take and check the recording"
             );
             if take.is_live {
-                eprintln!("sync-check: jump and wave both arms before all cameras for {} s, please", args.seconds);
+                eprintln!("sync-check: jump and wave both arms before all cameras for {} s, please", args.span.secs);
             }
             let (estimates, frames) = by_motion(args, take.sources, &cameras, &take.sync, take.is_live)?;
             let mend = "its motion does not correlate with that of other cameras, is too slow, or too short (under five seconds): jump and wave both \
@@ -82,7 +99,7 @@ fn by_motion(
             Ok(frame) => frame,
             Err(PopError::Closed) => break,
             Err(PopError::Timeout)
-                if is_live && started.elapsed().as_secs_f64() > args.from_secs + args.seconds + 5.0 =>
+                if is_live && started.elapsed().as_secs_f64() > args.span.from_secs + args.span.secs + 5.0 =>
             {
                 break;
             }
@@ -90,10 +107,10 @@ fn by_motion(
         };
         let from = *first.get_or_insert(frame.capture_nanos);
         let at = frame.capture_nanos.saturating_sub(from) as f64 * 1e-9;
-        if at > args.from_secs + args.seconds {
+        if at > args.span.from_secs + args.span.secs {
             break;
         }
-        if at < args.from_secs {
+        if at < args.span.from_secs {
             continue;
         }
         let image = &frame.image;
@@ -142,7 +159,7 @@ fn by_silhouettes(
         rig,
         take.sync,
         spread_nanos,
-        [args.from_secs, args.from_secs + args.seconds],
+        [args.span.from_secs, args.span.from_secs + args.span.secs],
         "silhouettes, ms of the take",
         |set| {
             set.present().for_each(|(slot, _)| pictures[slot] += 1);
@@ -163,6 +180,7 @@ fn by_silhouettes(
 mod tests {
     use flyrig_capture::CameraSource as _;
     use flyrig_gpu::AdapterChoice;
+    use flyrig_report::arguments::FpsArgs;
     use flyrig_report::dataset;
     use flyrig_sim::{Fault, FaultKind, FaultScript, MotionConfig, MotionKind, SimConfig, SimTime, Simulator};
     use rand::{RngExt as _, SeedableRng as _, rngs::SmallRng};
@@ -241,7 +259,12 @@ mod tests {
     }
 
     fn args() -> SyncCheckArgs {
-        SyncCheckArgs { input: Vec::new(), seconds: 20.0, from_secs: 0.0, most_ms: 250.0, fps: 30.0, calibration: None }
+        SyncCheckArgs {
+            most_ms: 250.0,
+            source: InputArgs { input: Vec::new(), rate: FpsArgs { fps: 30.0 } },
+            calibration: CalibrationArgs { calibration: None },
+            span: SpanArgs { secs: 20.0, from_secs: 0.0 },
+        }
     }
 
     #[test]

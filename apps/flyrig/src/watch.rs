@@ -8,7 +8,8 @@ use std::{
 };
 
 use anyhow::{Context, Result, bail, ensure};
-use flyrig_report::{png, stop, write_whole};
+use clap::Args;
+use flyrig_report::{arguments::parse_size, png, stop, write_whole};
 use flyrig_transport::{
     ImageFormat, Interests, Received, Subscriber, TransportConfig, TransportError, TransportErrorKind, ViewFrame,
     ViewpointStatus, Views, printable,
@@ -21,7 +22,55 @@ use opencv::{
 };
 use serde::{Deserialize, Serialize};
 
-use crate::cli::WatchArgs;
+use crate::arguments::{RigArgs, StopArgs};
+
+/// Arguments of `flyrig watch`.
+#[derive(Debug, Args)]
+pub struct WatchArgs {
+    #[command(flatten)]
+    pub rig: RigArgs,
+    /// Name of a published view; --eye requests a viewpoint instead.
+    #[arg(long, default_value = "main")]
+    pub view: String,
+    /// Request a viewpoint: camera position x,y,z, metres in the world of the rig.
+    #[arg(long, value_parser = parse_vec3, allow_hyphen_values = true)]
+    pub eye: Option<[f64; 3]>,
+    /// Point at which the viewpoint of --eye is aimed.
+    #[arg(long, value_parser = parse_vec3, allow_hyphen_values = true, default_value = "0,0,1")]
+    pub target: [f64; 3],
+    /// Size of the viewpoint of --eye, WIDTHxHEIGHT.
+    #[arg(long, value_parser = parse_size, default_value = "512x512")]
+    pub size: [u32; 2],
+    /// Vertical field of view of the viewpoint of --eye, degrees.
+    #[arg(long, default_value_t = 40.0)]
+    pub fov_degrees: f64,
+    /// Largest frame rate of the viewpoint of --eye; viewers share the rig's budget of pixels per second.
+    #[arg(long, default_value_t = 30.0)]
+    pub max_fps: f64,
+    /// Write every image as PNG into this folder, or a video if the name ends in .mp4 or .avi.
+    #[arg(long)]
+    pub out: Option<PathBuf>,
+    /// Record the person stream into this MCAP file, for `flyrig play`, without receiving images.
+    #[arg(long, conflicts_with_all = ["out", "eye", "count", "stats"])]
+    pub record: Option<PathBuf>,
+    /// Stop after this many images.
+    #[arg(long)]
+    pub count: Option<usize>,
+    /// Stop when the rig ends its session.
+    #[arg(long)]
+    pub until_end: bool,
+    /// Write rates and latency as JSON at the end.
+    #[arg(long)]
+    pub stats: Option<PathBuf>,
+    #[command(flatten)]
+    pub stop: StopArgs,
+}
+
+fn parse_vec3(text: &str) -> Result<[f64; 3], String> {
+    let numbers: Vec<f64> =
+        text.split(',').filter_map(|n| n.trim().parse().ok()).filter(|n: &f64| n.is_finite()).collect();
+    numbers.try_into().ok().filter(|_| text.split(',').count() == 3).ok_or_else(|| format!("'{text}' is not x,y,z"))
+}
 
 /// How often rates are printed.
 const PRINT_EVERY: Duration = Duration::from_secs(1);
@@ -102,7 +151,7 @@ pub fn watch(args: &WatchArgs) -> Result<()> {
         if args.until_end && received > 0 && subscriber.publishers() == 0 {
             break;
         }
-        let over_time = args.seconds.is_some_and(|limit| started.elapsed().as_secs_f64() >= limit);
+        let over_time = args.stop.seconds.is_some_and(|limit| started.elapsed().as_secs_f64() >= limit);
         if over_time || args.count.is_some_and(|count| received >= count as u64) {
             break;
         }
@@ -296,6 +345,14 @@ fn open_video(path: &Path, width: u32, height: u32) -> Result<VideoWriter> {
 #[cfg(test)]
 mod tests {
     use flyrig_transport::Header;
+
+    #[test]
+    fn odd_positions_are_refused() {
+        assert_eq!(parse_vec3("1,-2.5,3"), Ok([1.0, -2.5, 3.0]));
+        for bad in ["", "1,2", "1,2,3,4", "a,b,c", "1,2,nan", "1,,3"] {
+            assert!(parse_vec3(bad).is_err(), "{bad}");
+        }
+    }
 
     use super::*;
 

@@ -1,6 +1,54 @@
-//! Parsers of command-line arguments that the programs share.
+//! Command-line arguments that the programs share: groups to flatten into a command's own, and parsers.
+//!
+//! A command gives a flattened argument a default of its own with `mut_arg`.
 
-use std::ops::Range;
+use std::{ops::Range, path::PathBuf};
+
+use anyhow::{Context as _, Result};
+use clap::{Args, builder::TypedValueParser as _};
+use flyrig_body::DEFAULT_GAUSSIAN_COUNT;
+
+/// Folder of a command's results.
+#[derive(Debug, Clone, Args)]
+pub struct OutputArgs {
+    /// Folder of the results; created where it is missing.
+    #[arg(long, default_value = "out")]
+    pub out: PathBuf,
+}
+
+impl OutputArgs {
+    /// Creates the folder.
+    ///
+    /// # Errors
+    /// Names the folder that cannot be created.
+    pub fn create(&self) -> Result<()> {
+        std::fs::create_dir_all(&self.out).with_context(|| format!("cannot create {}", self.out.display()))
+    }
+}
+
+/// Number of Gaussians.
+#[derive(Debug, Clone, Args)]
+pub struct GaussiansArgs {
+    /// Gaussians on the person's surface.
+    #[arg(long, default_value_t = DEFAULT_GAUSSIAN_COUNT, value_parser = clap::value_parser!(u32).range(200..=2_000_000).map(|n| n as usize))]
+    pub gaussians: usize,
+}
+
+/// Frame rate of images without timestamps.
+#[derive(Debug, Clone, Args)]
+pub struct FpsArgs {
+    /// Frames per second of a folder of images; recordings and videos have their own timestamps.
+    #[arg(long, default_value_t = 30.0, value_parser = parse_fps)]
+    pub fps: f64,
+}
+
+/// Range of a take's frames.
+#[derive(Debug, Clone, Args)]
+pub struct FramesArgs {
+    /// Frames FIRST..END, END excluded; all frames otherwise.
+    #[arg(long, value_parser = parse_range)]
+    pub frames: Option<Range<u64>>,
+}
 
 /// Parses WIDTHxHEIGHT, 16 to 4096 pixels a side.
 ///
@@ -47,14 +95,14 @@ pub fn parse_speed(text: &str) -> Result<f64, String> {
     }
 }
 
-/// Parses 0.1 to 1000 frames a second.
+/// Parses 0.1 to 1000 frames per second.
 ///
 /// # Errors
 /// Says what was expected.
 pub fn parse_fps(text: &str) -> Result<f64, String> {
     match text.parse::<f64>() {
         Ok(fps) if (0.1..=1000.0).contains(&fps) => Ok(fps),
-        _ => Err(format!("'{text}' is not between 0.1 and 1000 frames a second")),
+        _ => Err(format!("'{text}' is not between 0.1 and 1000 frames per second")),
     }
 }
 
@@ -67,5 +115,22 @@ pub fn parse_range(text: &str) -> Result<Range<u64>, String> {
     match ends {
         Some((a, b)) if a < b => Ok(a..b),
         _ => Err(format!("'{text}' is not a range of frames like 0..60 (the end is excluded)")),
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn odd_ranges_and_sizes_are_refused() {
+        assert_eq!(parse_range("3..7"), Ok(3..7));
+        for bad in ["3", "7..3", "3..3", "-1..4", "a..b"] {
+            assert!(parse_range(bad).is_err(), "{bad}");
+        }
+        assert_eq!(parse_size("640x480"), Ok([640, 480]));
+        for bad in ["0x0", "640", "640x100000", "x"] {
+            assert!(parse_size(bad).is_err(), "{bad}");
+        }
     }
 }

@@ -51,9 +51,10 @@ impl Scene {
     fn session(&self, gpu: &GpuContext, frames: usize) -> Session {
         let keys = (0..frames + 2).map(|frame| (frame as i64 * FRAME_NANOS, self.pose(frame as f64))).collect();
         let track = PoseTrack::new(keys).unwrap();
-        let tracking = TrackingSettings { rest: 0.0, ..TrackingSettings::default() };
+        let tracking = TrackingSettings::default();
         let mut options: DeformOptions = tracking.options().unwrap();
         options.max_level = 1;
+        options.solver.rest = 0.0;
         let settings = SessionSettings {
             body: BodySettings { gaussians: 3000, nodes: 60, ..BodySettings::default() },
             tracking: TrackingSettings { replaced: Some(options), ..tracking },

@@ -55,16 +55,21 @@ pub fn wait_until(what: &str, mut done: impl FnMut() -> bool) {
     }
 }
 
-/// Writes `rig.toml` of a small simulated rig with this name and returns the endpoint that it listens on. `more` is appended.
+/// Simulated cameras of [`small_rig`].
+pub const SMALL_SIM: &str = "width = 96\nheight = 96\ntexture_px = 128\n";
+
+/// Writes `rig.toml` and `sim.toml` of a small simulated rig with this name, and returns the endpoint that it listens on. `more` is
+/// appended to `rig.toml`.
 pub fn small_rig(name: &str, folder: &Path, more: &str) -> String {
     let port = std::net::TcpListener::bind("127.0.0.1:0").unwrap().local_addr().unwrap().port();
     let endpoint = format!("tcp/127.0.0.1:{port}");
     let config = format!(
-        "[rig]\nname = \"{name}\"\n[source]\ncameras = [\"00\", \"03\"]\n[sim]\nwidth = 96\nheight = 96\n\
-         texture_px = 128\n[perception]\npose = \"given\"\nmasks = \"given\"\n\
+        "[rig]\nname = \"{name}\"\n[source]\npath = \"sim.toml\"\ncameras = [\"00\", \"03\"]\n\
+         [perception]\npose = \"given\"\nmasks = \"given\"\n\
          [body]\ngaussians = 3000\nnodes = 100\n[output]\nwidth = 96\nheight = 96\n\
          [transport]\nlisten = [\"{endpoint}\"]\n{more}"
     );
     std::fs::write(folder.join("rig.toml"), config).unwrap();
+    std::fs::write(folder.join("sim.toml"), SMALL_SIM).unwrap();
     endpoint
 }

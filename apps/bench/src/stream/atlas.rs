@@ -1,7 +1,7 @@
-//! Colours as a video: all Gaussians in the order of the template along a Z-shaped curve, coded as VP9 by the program ffmpeg.
+//! Colours as a video: all Gaussians in template order along a Z-order curve, coded as VP9 by the program ffmpeg.
 //!
-//! The template's order halves the surface again and again, as the curve does the image: neighbours on the surface lie near each
-//! other. Motion is that of the stream. A key frame comes every second, as the stream refreshes its colours.
+//! The template order bisects the surface recursively, as the curve does the image: neighbours on the surface are near each other. Motion
+//! is that of the stream. A key frame comes every second, as the stream refreshes its colours.
 
 use std::{
     io::Write as _,
@@ -14,20 +14,20 @@ use flyrig_fusion::PersonFrame;
 use flyrig_renderer::{linear_from_srgb, srgb_from_linear};
 
 use super::{
-    forms::{Coded, Form, Stream},
-    take::{Kept, Take},
+    forms::{Coded, Form, StreamForm},
+    take::{CodedTake, Kept},
 };
 
-/// Of the format IVF, which ffmpeg writes: the file's header, and the header of each frame, which starts with its size.
+/// Bytes of the headers of an IVF file, which ffmpeg writes, and of each of its frames, which starts with its size.
 const FILE_HEADER: usize = 32;
 const FRAME_HEADER: usize = 12;
 
-/// Returns whether there is a codec.
+/// Returns whether ffmpeg can be run.
 pub fn has_codec() -> bool {
     ffmpeg(&["-version"], &[]).is_ok()
 }
 
-/// Runs ffmpeg from standard input to standard output; returns its processor time, seconds, as well.
+/// Runs ffmpeg from standard input to standard output. Returns also its processor time, seconds.
 fn ffmpeg(arguments: &[&str], input: &[u8]) -> Result<(Vec<u8>, f64)> {
     let mut command = Command::new("ffmpeg");
     command.args(["-nostdin", "-hide_banner", "-nostats", "-benchmark"]).args(arguments);
@@ -51,7 +51,7 @@ fn processor_secs(log: &str) -> f64 {
     part("utime=").unwrap_or(0.0) + part("stime=").unwrap_or(0.0)
 }
 
-/// Places of Gaussians in an image whose sides are powers of two.
+/// Layout of Gaussians in an image whose sides are powers of two.
 #[derive(Debug, Clone, Copy, PartialEq)]
 struct Layout {
     gaussians: usize,
@@ -67,23 +67,23 @@ impl Layout {
         [1 << self.bits.div_ceil(2), 1 << (self.bits / 2)]
     }
 
-    /// Pixel of a cell of the curve: its even bits are x, its odd bits y.
+    /// Returns the pixel of a cell of the curve: its even bits are x, its odd bits y.
     fn pixel(self, cell: usize) -> usize {
         let half = |first: u32| (first..self.bits).step_by(2).map(|bit| (cell >> bit & 1) << (bit / 2)).sum::<usize>();
         half(1) * self.size()[0] + half(0)
     }
 
-    /// The Gaussian that a cell shows: each has one cell or two.
+    /// Returns the Gaussian of a cell: each has one cell or two.
     fn gaussian(self, cell: usize) -> usize {
         (cell * self.gaussians) >> self.bits
     }
 
-    /// First cell of a Gaussian.
+    /// Returns the first cell of a Gaussian.
     fn cell(self, gaussian: usize) -> usize {
         (gaussian << self.bits).div_ceil(self.gaussians)
     }
 
-    /// sRGB bytes of an image.
+    /// Renders colours into the sRGB bytes of an image.
     fn image(self, frame: &PersonFrame, colors: &[[f32; 4]]) -> Vec<u8> {
         let mut image = vec![0; 3 << self.bits];
         let order = &frame.template().gaussian_order;
@@ -97,7 +97,7 @@ impl Layout {
         image
     }
 
-    /// Linear colours in the template's order.
+    /// Reads linear colours in template order.
     fn colors(self, image: &[u8]) -> Vec<[f32; 4]> {
         let of = |gaussian| {
             let at = 3 * self.pixel(self.cell(gaussian));
@@ -108,25 +108,25 @@ impl Layout {
     }
 }
 
-/// A take whose colours went through the codec.
-pub struct Atlas {
+/// A take with colours decoded from the video.
+pub struct VideoAtlas {
     crf: u8,
     layout: Layout,
-    /// By frame of the take.
+    /// Bytes of the video by frame of the take.
     sizes: Vec<usize>,
     images: Vec<u8>,
-    /// Mean milliseconds a frame, ffmpeg's start and conversion of colours included.
+    /// Mean milliseconds per frame, including the start of ffmpeg and colour conversion.
     encode_ms: f64,
     decode_ms: f64,
-    motion: Stream,
+    motion: StreamForm,
 }
 
-impl Atlas {
-    /// Codes the colours of a take with this constant quality: 0 is best, 63 worst.
+impl VideoAtlas {
+    /// Codes the colours of a take with a constant quality: 0 is best, 63 worst.
     ///
     /// # Errors
-    /// The program's failure, or a number of Gaussians that changes.
-    pub fn new(crf: u8, take: &Take) -> Result<Self> {
+    /// Failures of ffmpeg, or a changing number of Gaussians.
+    pub fn new(crf: u8, take: &CodedTake) -> Result<Self> {
         let layout = Layout::new(take.kept.first().map_or(0, |kept| kept.splats.color.len()));
         let [width, height] = layout.size();
         let mut images = Vec::new();
@@ -153,12 +153,12 @@ impl Atlas {
         let sizes = frame_sizes(&video);
         let (coded, wanted) = (sizes.len(), take.kept.len());
         ensure!(coded == wanted && back.len() == images.len(), "{coded} of {wanted} frames came out of the codec");
-        let motion = Stream::new(flyrig_stream::ColorSettings::default().step);
+        let motion = StreamForm::new(flyrig_stream::ColorSettings::default().step);
         Ok(Self { crf, layout, sizes, images: back, encode_ms, decode_ms, motion })
     }
 }
 
-/// Bytes of each frame of an IVF file, without headers.
+/// Returns the bytes of each frame of an IVF file, without headers.
 fn frame_sizes(video: &[u8]) -> Vec<usize> {
     let mut rest = video.get(FILE_HEADER..).unwrap_or_default();
     let mut sizes = Vec::new();
@@ -170,7 +170,7 @@ fn frame_sizes(video: &[u8]) -> Vec<usize> {
     sizes
 }
 
-impl Form for Atlas {
+impl Form for VideoAtlas {
     fn name(&self) -> String {
         format!("VP9 atlas, crf {}", self.crf)
     }

@@ -1,4 +1,4 @@
-//! Forms in which Gaussians travel: the stream, and every frame by itself.
+//! Encodings of Gaussians: the person stream, and every frame by itself.
 
 use std::{sync::Arc, time::Duration};
 
@@ -13,7 +13,7 @@ use super::{spz, take::Kept};
 /// Level of zstd; its own default.
 const ZSTD_LEVEL: i32 = 3;
 
-/// A frame as a viewer has it, and its cost.
+/// A frame as a viewer receives it, and its cost.
 pub struct Coded {
     /// Centres, standard deviations and normals.
     pub posed: Posed,
@@ -21,7 +21,7 @@ pub struct Coded {
     pub axes: Option<PosedAxes>,
     /// Linear colours and opacities.
     pub colors: Arc<Vec<[f32; 4]>>,
-    /// All bytes of the frame, those of the motion alone, and those sent once.
+    /// Bytes of the frame, of its motion alone, and of the template that is sent once.
     pub bytes: usize,
     pub motion_bytes: usize,
     pub template_bytes: usize,
@@ -31,28 +31,28 @@ pub struct Coded {
     pub pose_ms: f64,
 }
 
-/// A way to send a take's frames, one after the other.
+/// An encoding of the frames of a take.
 pub trait Form {
-    /// For tables.
+    /// Returns the name for tables.
     fn name(&self) -> String;
 
-    /// Sends frame `at` of the take through.
+    /// Encodes and decodes frame `at` of the take.
     fn code(&mut self, at: usize, kept: &Kept) -> Result<Coded>;
 }
 
 /// The person stream with a quantisation step.
-pub struct Stream {
+pub struct StreamForm {
     settings: ColorSettings,
     coder: Option<(PersonEncoder, StreamPerson)>,
 }
 
-impl Stream {
+impl StreamForm {
     pub fn new(step: f32) -> Self {
         Self { settings: ColorSettings { step, ..ColorSettings::default() }, coder: None }
     }
 }
 
-impl Form for Stream {
+impl Form for StreamForm {
     fn name(&self) -> String {
         format!("stream, step {}", self.settings.step)
     }
@@ -97,7 +97,7 @@ impl Form for Stream {
     }
 }
 
-/// The person's avatar once, then poses alone.
+/// The avatar of the person once, then poses alone.
 pub struct AvatarPoses {
     avatar: Arc<EncodedTemplate>,
     person: StreamPerson,
@@ -144,7 +144,7 @@ impl Form for AvatarPoses {
     }
 }
 
-/// Every Gaussian of every frame as `output.splats` quantises them, compressed by zstd.
+/// Every Gaussian of every frame, quantised as by `output.splats` and compressed by zstd.
 pub struct Packed;
 
 impl Form for Packed {
@@ -181,7 +181,7 @@ impl Form for Spz {
     }
 }
 
-/// A frame that holds everything.
+/// Builds the result of a frame that is coded by itself.
 fn whole(posed: Posed, colors: Vec<[f32; 4]>, bytes: usize, [encode_ms, decode_ms]: [f64; 2]) -> Coded {
     let (motion_bytes, template_bytes, pose_ms) = (0, 0, 0.0);
     Coded {
@@ -197,7 +197,7 @@ fn whole(posed: Posed, colors: Vec<[f32; 4]>, bytes: usize, [encode_ms, decode_m
     }
 }
 
-/// Processor time of the thread: other programs do not count.
+/// Start of a measurement of the thread's processor time, which other programs do not affect.
 struct Start(Duration);
 
 impl Start {

@@ -1,4 +1,4 @@
-//! Bytes, run times and errors of one form, frame by frame.
+//! Sums of bytes, run times and errors of one encoding.
 
 use anyhow::Result;
 use flyrig_metrics::{CameraScore, Picture, ScoreSheet, person_box, psnr, score_view};
@@ -7,35 +7,35 @@ use flyrig_viewer::{PeopleScene, ShownPerson};
 
 use super::{
     forms::Coded,
-    table::Row,
-    take::{Kept, Take},
+    table::FormRow,
+    take::{CodedTake, Kept},
 };
 
-/// Sums of a form so far.
+/// Sums of an encoding over its frames.
 #[derive(Default)]
-pub struct Tally {
+pub struct FormTally {
     sizes: Vec<usize>,
     gaussians: usize,
     motion: usize,
     template: usize,
     /// Milliseconds of encoding, decoding and posing.
     times: [f64; 3],
-    /// Decibels of each view against the uncoded one.
+    /// PSNR of each view against the uncoded one, decibels.
     coded: Vec<f64>,
     sheet: ScoreSheet,
-    /// Error images of the frame before, by camera.
+    /// Error images of the previous frame, by camera.
     before: Vec<Option<Vec<f32>>>,
-    /// Squared changes of the error, and their number.
+    /// Sum of squared changes of the error, and their number.
     flicker: (f64, u64),
 }
 
-impl Tally {
+impl FormTally {
     pub fn new(cameras: usize) -> Self {
         Self { before: vec![None; cameras], ..Self::default() }
     }
 
-    /// Draws and scores a frame.
-    pub fn add(&mut self, take: &Take, kept: &Kept, coded: &Coded, scene: &mut PeopleScene) -> Result<()> {
+    /// Renders and scores a frame.
+    pub fn add(&mut self, take: &CodedTake, kept: &Kept, coded: &Coded, scene: &mut PeopleScene) -> Result<()> {
         self.sizes.push(coded.bytes);
         self.gaussians = coded.posed.center_scale.len();
         self.motion += coded.motion_bytes;
@@ -77,8 +77,8 @@ impl Tally {
         Ok(())
     }
 
-    /// The row of a table.
-    pub fn row(mut self, take: &Take, form: String) -> Row {
+    /// Returns the row of the table.
+    pub fn row(mut self, take: &CodedTake, form: String) -> FormRow {
         let frames = self.sizes.len().max(1) as f64;
         let bytes = self.sizes.iter().sum::<usize>() as f64 / frames;
         self.sizes.sort_unstable();
@@ -88,7 +88,7 @@ impl Tally {
         // Decibels of the mean error: frames without any would dominate a mean of decibels.
         let squares: f64 = self.coded.iter().map(|db| 10f64.powf(-db / 10.0)).sum();
         let [encode_ms, decode_ms, pose_ms] = self.times.map(|sum| sum / frames);
-        Row {
+        FormRow {
             dataset: take.name.clone(),
             pose: take.pose,
             form,

@@ -1,4 +1,4 @@
-//! SPZ, Niantic's public format of Gaussians, version 2: one frame a file, without harmonics.
+//! SPZ, Niantic's public format of Gaussians, version 2: one frame per file, without harmonics.
 //!
 //! A gzip stream of a header of 16 bytes and, attribute by attribute, positions (three signed fixed-point numbers of 24 bits),
 //! opacities, colours, logarithms of the three standard deviations, and x, y, z of the rotation. A Gaussian here has one standard
@@ -15,15 +15,15 @@ use glam::{Quat, Vec3};
 const MAGIC: u32 = 0x5053_474e;
 const VERSION: u32 = 2;
 const HEADER: usize = 16;
-/// Bits of a position behind the point, as files usually have them: steps of a quarter of a millimetre.
+/// Fractional bits of a position, as in most files: steps of a quarter of a millimetre.
 const FRACTION_BITS: u8 = 12;
 /// Bytes of a Gaussian: position, opacity, colour, standard deviations, rotation.
 const WIDTHS: [usize; 5] = [9, 1, 3, 3, 3];
-/// A colour is the constant harmonic's coefficient, stored with this factor.
+/// Factor of a stored colour, the coefficient of the constant harmonic.
 const COLOR_FACTOR: f32 = 0.15;
 /// Value of the constant harmonic.
 const HARMONIC: f32 = 0.282_094_8;
-/// Step and offset of the logarithms.
+/// Step and offset of stored logarithms.
 const LOG_STEP: f32 = 1.0 / 16.0;
 const LOG_OFFSET: f32 = -10.0;
 
@@ -57,7 +57,7 @@ pub fn encode(center_scale: &[[f32; 4]], normals: &[[f32; 4]], colors: &[[f32; 4
     Ok(packed.finish()?)
 }
 
-/// Decodes what [`encode`] encodes.
+/// Decodes a file of [`encode`].
 ///
 /// # Errors
 /// Says what is wrong with the bytes.
@@ -98,7 +98,7 @@ pub fn decode(packed: &[u8]) -> Result<(Posed, Vec<[f32; 4]>)> {
     Ok((posed, colors.collect()))
 }
 
-/// Nearest byte; `as` saturates.
+/// Rounds to the nearest byte; `as` saturates.
 fn byte(value: f32) -> u8 {
     value.round() as u8
 }

@@ -6,48 +6,48 @@ use flyrig_fusion::Origin;
 use flyrig_report::plot::{Line, Plot, Series};
 use serde::Serialize;
 
-use crate::scale::exponent;
+use crate::harness::statistics::exponent;
 
-/// One data set in one form.
+/// Result of one data set in one encoding.
 #[derive(Debug, Serialize)]
-pub struct Row {
+pub struct FormRow {
     pub dataset: String,
-    /// Where pose and masks came from.
+    /// Source of pose and masks.
     pub pose: Origin,
     pub form: String,
     pub gaussians: usize,
     pub template_bytes: usize,
-    /// Bytes of a frame: mean, 99th percentile, and of the motion alone.
+    /// Bytes per frame: mean, 99th percentile, and mean of the motion alone.
     pub bytes: f64,
     pub p99_bytes: f64,
     pub motion_bytes: f64,
-    /// Against the rendering of the same Gaussians uncoded, in the person's box: mean and worst view.
+    /// PSNR against the rendering of the uncoded Gaussians in the person's box: mean and worst view.
     pub coded_db: f64,
     pub worst_db: f64,
-    /// Against the held-out images: uncoded, and lost by coding.
+    /// Scores against the held-out images: uncoded, and losses by coding.
     pub truth_db: Option<f64>,
     pub lost_db: Option<f64>,
     pub lost_ssim: Option<f64>,
     pub gained_flip: Option<f64>,
-    /// Change from frame to frame of the error of coding, RMS, codes of 255.
+    /// RMS change of the coding error from frame to frame, in units of 1/255.
     pub flicker: f64,
-    /// Mean milliseconds a frame on one core.
+    /// Mean milliseconds per frame on one core.
     pub encode_ms: f64,
     pub decode_ms: f64,
     pub pose_ms: f64,
 }
 
-fn pose(row: &Row) -> &'static str {
+fn pose(row: &FormRow) -> &'static str {
     match row.pose {
         Origin::Given => "given",
         Origin::Estimated => "estimated",
     }
 }
 
-/// The table.
-pub fn table(rows: &[Row]) -> String {
+/// Formats the table.
+pub fn table(rows: &[FormRow]) -> String {
     let mut text = String::from(
-        "| data set | pose, masks | form | Gaussians | KB a frame | p99 | motion KB | Mbit/s at 30 | template MB | dB to uncoded | worst | dB lost | SSIM lost | FLIP gained | flicker | encode ms | decode ms | pose ms |\n\
+        "| data set | pose, masks | form | Gaussians | KB per frame | p99 | motion KB | Mbit/s at 30 | template MB | dB to uncoded | worst | dB lost | SSIM lost | FLIP gained | flicker | encode ms | decode ms | pose ms |\n\
          |---|---|---|---|---|---|---|---|---|---|---|---|---|---|---|---|---|---|\n",
     );
     let number = |value: Option<f64>, digits: usize| value.map_or("-".to_owned(), |value| format!("{value:.digits$}"));
@@ -78,10 +78,10 @@ pub fn table(rows: &[Row]) -> String {
     text
 }
 
-/// Rows that differ in their number of Gaussians alone, together.
-fn families(rows: &[Row]) -> Vec<Vec<&Row>> {
-    let mut families: Vec<Vec<&Row>> = Vec::new();
-    let same = |a: &Row, b: &Row| a.dataset == b.dataset && a.pose == b.pose && a.form == b.form;
+/// Groups rows that differ only in their number of Gaussians.
+fn families(rows: &[FormRow]) -> Vec<Vec<&FormRow>> {
+    let mut families: Vec<Vec<&FormRow>> = Vec::new();
+    let same = |a: &FormRow, b: &FormRow| a.dataset == b.dataset && a.pose == b.pose && a.form == b.form;
     for row in rows {
         match families.iter_mut().find(|family| same(family[0], row)) {
             Some(family) => family.push(row),
@@ -91,26 +91,26 @@ fn families(rows: &[Row]) -> Vec<Vec<&Row>> {
     families
 }
 
-/// The powers of the number of Gaussians with which bytes and times grow; empty where there is one number only.
-pub fn exponents(rows: &[Row]) -> String {
+/// Formats the exponents with which bytes and times grow with the number of Gaussians; empty for a single number.
+pub fn exponents(rows: &[FormRow]) -> String {
     let mut text = String::new();
     for family in families(rows).into_iter().filter(|family| family.len() > 1) {
         if text.is_empty() {
             text += "\n| data set | pose, masks | form | bytes grow with Gaussians to the power of | encoding | decoding |\n|---|---|---|---|---|---|\n";
         }
-        let of = |value: fn(&Row) -> f64| {
+        let of = |value: fn(&FormRow) -> f64| {
             exponent(&family.iter().map(|row| (row.gaussians as f64, value(row))).collect::<Vec<_>>())
         };
         let [bytes, encoding, decoding] = [of(|row| row.bytes), of(|row| row.encode_ms), of(|row| row.decode_ms)];
-        let Row { dataset, form, .. } = family[0];
+        let FormRow { dataset, form, .. } = family[0];
         let _ =
             writeln!(text, "| {dataset} | {} | {form} | {bytes:.2} | {encoding:.2} | {decoding:.2} |", pose(family[0]));
     }
     text
 }
 
-/// The rows with more digits.
-pub fn csv(rows: &[Row]) -> String {
+/// Formats the rows as CSV, with more digits.
+pub fn csv(rows: &[FormRow]) -> String {
     let mut text = String::from(
         "dataset,pose,form,gaussians,template_bytes,bytes,p99_bytes,motion_bytes,coded_db,worst_db,truth_db,lost_db,lost_ssim,gained_flip,flicker,encode_ms,decode_ms,pose_ms\n",
     );
@@ -142,8 +142,8 @@ pub fn csv(rows: &[Row]) -> String {
     text
 }
 
-/// Bytes against quality: a line for each data set, pose, number of Gaussians and kind of form.
-pub fn plot(rows: &[Row]) -> Plot {
+/// Plots bytes against quality: a line for each data set, pose, number of Gaussians and kind of encoding.
+pub fn plot(rows: &[FormRow]) -> Plot {
     let mut series: Vec<Series> = Vec::new();
     for row in rows {
         let (kind, setting) = row.form.split_once(", ").unwrap_or((&row.form, ""));
@@ -158,8 +158,8 @@ pub fn plot(rows: &[Row]) -> Plot {
         }
     }
     Plot {
-        title: "Bytes of a frame against quality".to_owned(),
-        x_label: "KB a frame".to_owned(),
+        title: "Bytes per frame against quality".to_owned(),
+        x_label: "KB per frame".to_owned(),
         y_label: "PSNR against the uncoded rendering, dB".to_owned(),
         log_x: true,
         log_y: false,
@@ -171,8 +171,8 @@ pub fn plot(rows: &[Row]) -> Plot {
 mod tests {
     use super::*;
 
-    fn row(form: &str, gaussians: usize, bytes: f64) -> Row {
-        Row {
+    fn row(form: &str, gaussians: usize, bytes: f64) -> FormRow {
+        FormRow {
             dataset: "d".to_owned(),
             pose: Origin::Given,
             form: form.to_owned(),

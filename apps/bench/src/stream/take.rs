@@ -1,4 +1,4 @@
-//! People to code: what a session gives of a data set, kept so that every form codes the same.
+//! Tracked people to encode, kept so that every encoding gets the same input.
 
 use std::{
     path::{Path, PathBuf},
@@ -14,51 +14,33 @@ use flyrig_sim::{ExportOptions, MotionConfig, MotionKind, SimConfig, Simulator, 
 use flyrig_stream::EncodedTemplate;
 use flyrig_transport::SplatState;
 use flyrig_types::{Camera, Image, Mask, RenderedView};
-use serde::{Deserialize as _, de::IntoDeserializer as _};
 
-use crate::{cli::BenchStreamArgs, stress::copy};
+use super::{
+    arguments::BenchStreamArgs,
+    subject::{CodedSubject, SIMULATED},
+};
+use crate::harness::images::copy;
 
-/// Sets that are neither counted nor scored: colours are sent for the first time.
+/// Frame sets that are neither counted nor scored: colours are sent for the first time.
 const WARM_UP: usize = 12;
-/// Frames of a simulated person, where no range is given.
+/// Default number of frames of a simulated person.
 const SIMULATED_FRAMES: u64 = 40;
-/// Starts the name of a simulated person.
-const SIMULATED: &str = "sim:";
-
-/// A data set to code.
-#[derive(Debug, Clone)]
-pub enum Subject {
-    /// A folder in EasyMocap layout.
-    Folder(PathBuf),
-    /// A simulated person with this motion.
-    Simulated(MotionKind, String),
-}
-
-impl std::str::FromStr for Subject {
-    type Err = String;
-
-    fn from_str(text: &str) -> Result<Self, String> {
-        let Some(name) = text.strip_prefix(SIMULATED) else { return Ok(Self::Folder(text.into())) };
-        let kind: Result<MotionKind, serde::de::value::Error> = MotionKind::deserialize(name.into_deserializer());
-        Ok(Self::Simulated(kind.map_err(|error| error.to_string())?, name.to_owned()))
-    }
-}
-
-/// Returns name and folder of every data set; simulated people are exported to the folder of the results first, unless they are
-/// there already. Each has a seed of its own.
+/// Returns name and folder of every data set; simulated people, each with its own seed, are first exported to the folder of the results,
+/// unless they are there already.
 pub fn folders(args: &BenchStreamArgs, gpu: &GpuContext) -> Result<Vec<(String, PathBuf)>> {
-    let mut seed = args.seed;
+    let mut seed = args.simulation.seed;
     let mut folders = Vec::new();
     for subject in &args.datasets {
         folders.push(match subject {
-            Subject::Folder(path) => {
+            CodedSubject::Folder(path) => {
                 let name = path.file_name().map(|name| name.to_string_lossy().into_owned());
                 (name.unwrap_or_else(|| path.display().to_string()), path.clone())
             }
-            Subject::Simulated(kind, motion) => {
+            CodedSubject::Simulated(kind, motion) => {
                 let frames = args.replay.frames.as_ref().map_or(SIMULATED_FRAMES, |frames| frames.end);
-                let folder = args.out.join("takes").join(format!("{motion}-{seed}-{}-{frames}", args.side));
-                simulate(gpu, &folder, *kind, seed, args.side, frames)?;
+                let folder =
+                    args.output.out.join("takes").join(format!("{motion}-{seed}-{}-{frames}", args.simulation.side));
+                simulate(gpu, &folder, *kind, seed, args.simulation.side, frames)?;
                 seed += 1;
                 (format!("{SIMULATED}{motion}"), folder)
             }
@@ -86,14 +68,14 @@ fn simulate(gpu: &GpuContext, folder: &Path, kind: MotionKind, seed: u64, side: 
 }
 
 /// A person's frames with the held-out views of them.
-pub struct Take {
+pub struct CodedTake {
     /// Name of the data set.
     pub name: String,
-    /// Where pose and masks came from.
+    /// Source of pose and masks.
     pub pose: Origin,
     /// Held-out cameras.
     pub cameras: Vec<Camera>,
-    /// Frames in which the person is there.
+    /// Frames that show the person.
     pub kept: Vec<Kept>,
     /// Scores of the uncoded person.
     pub uncoded: ScoreSheet,
@@ -105,13 +87,13 @@ pub struct Take {
 pub struct Kept {
     /// Number of the frame in the data set.
     pub number: u64,
-    /// Input of the stream's encoder.
+    /// Input of the encoder of the person stream.
     pub frame: PersonFrame,
     /// Centres, standard deviations and colours, in the order of the session.
     pub splats: SplatState,
     /// Unit normals; w: 0.
     pub normals: Vec<[f32; 4]>,
-    /// A view for each held-out camera; none while the stream warms up.
+    /// Views of the held-out cameras; empty during the warm-up.
     pub views: Vec<KeptView>,
 }
 
@@ -123,11 +105,11 @@ pub struct KeptView {
     pub truth: Option<(Image, Option<Mask>)>,
 }
 
-impl Take {
-    /// Replays a data set.
+impl CodedTake {
+    /// Replays a data set and keeps its frames.
     ///
     /// # Errors
-    /// Names what cannot be read, or says that nobody was found.
+    /// Names what cannot be read, or says that no person was found.
     pub fn record(
         args: &BenchStreamArgs,
         gpu: &GpuContext,
@@ -182,7 +164,7 @@ impl Take {
     }
 }
 
-/// The person's Gaussians as they were drawn last, with normals.
+/// Returns the Gaussians of the person as they were last rendered, with normals.
 fn splats(session: &Session) -> Result<(SplatState, Vec<[f32; 4]>)> {
     let splats = session.splats(PersonId::default())?;
     let state = SplatState {

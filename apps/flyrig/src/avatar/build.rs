@@ -1,22 +1,89 @@
 //! `flyrig avatar build`: tracks the person of a take, then fits an avatar to its images.
 
 use std::{
-    path::Path,
+    path::{Path, PathBuf},
     time::{Duration, Instant},
 };
 
 use anyhow::{Context as _, Result, ensure};
-use flyrig_avatar::{AtlasLayout, Avatar, AvatarScene, Bones, Card, ErrorWeights, Fit, FitSettings, LocalSettings};
+use clap::{Args, ValueEnum};
+use flyrig_avatar::{Avatar, AvatarScene, Bones, Card, Fit, FitSettings, LocalSettings};
+use flyrig_body::DEFAULT_NODE_COUNT;
 use flyrig_fusion::BodySettings;
 use flyrig_gpu::GpuContext;
 use flyrig_renderer::HarmonicOrder;
-use flyrig_report::{AvatarTake, png, progress_bar, stop};
+use flyrig_report::{AvatarTake, arguments::parse_minutes, png, progress_bar, stop};
 
-use super::{
-    arguments::{Atlas, BuildArgs, LocalArgs, Method, Order},
-    checkpoint::Checkpoint,
-    open_replay,
-};
+use super::{checkpoint::Checkpoint, open_replay};
+use crate::arguments::DatasetArgs;
+
+/// Default number of Gaussians, about 7 mm apart on an adult.
+const GAUSSIANS: u32 = 41_000;
+
+/// Arguments of `flyrig avatar build`.
+#[derive(Debug, Args)]
+pub struct AvatarBuildArgs {
+    #[command(flatten)]
+    pub take: DatasetArgs,
+    /// The avatar to write (*.flyavatar).
+    #[arg(long)]
+    pub out: PathBuf,
+    /// Gaussians on the person's surface.
+    #[arg(long, default_value_t = GAUSSIANS, value_parser = clap::value_parser!(u32).range(1000..=1_000_000))]
+    pub gaussians: u32,
+    /// Nodes of the deformation graph.
+    #[arg(long, default_value_t = DEFAULT_NODE_COUNT)]
+    pub nodes: usize,
+    /// Order of the spherical harmonics of the colours; higher orders depend more on the viewing direction.
+    #[arg(long, value_enum, default_value = "0")]
+    pub harmonics: Order,
+    /// Minutes of fitting, after tracking. Longer fits reproduce the images of the take better, and other views worse.
+    #[arg(long, default_value_t = 1.5, value_parser = parse_minutes, conflicts_with = "steps")]
+    pub minutes: f64,
+    /// Steps of fitting in place of minutes: the same steps and seed give the same bytes.
+    #[arg(long, value_parser = clap::value_parser!(u64).range(1..=1_000_000))]
+    pub steps: Option<u64>,
+    /// Weight of the attraction between neighbouring Gaussians; 0 turns it off.
+    #[arg(long, default_value_t = 5.0, value_parser = parse_pull)]
+    pub pull: f32,
+    /// Whether to learn the light of the room separately from the colours.
+    #[arg(long, default_value_t = true, action = clap::ArgAction::Set)]
+    pub light: bool,
+    /// Parametrization of the avatar.
+    #[arg(long, value_enum, default_value = "direct")]
+    pub method: Method,
+    /// Seed of the order of the images, and of networks.
+    #[arg(long, default_value_t = 1)]
+    pub seed: u64,
+}
+
+/// Order of the spherical harmonics.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, ValueEnum)]
+pub enum Order {
+    #[value(name = "0")]
+    Zero,
+    #[value(name = "1")]
+    One,
+    #[value(name = "2")]
+    Two,
+}
+
+/// Parametrization of an avatar while it is fitted.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, ValueEnum)]
+pub enum Method {
+    /// Independent attributes of every Gaussian.
+    Direct,
+    /// Networks that neighbouring Gaussians share, and an atlas of colours (LoGAvatar).
+    #[value(name = "logavatar")]
+    LogAvatar,
+}
+
+fn parse_pull(text: &str) -> Result<f32, String> {
+    match text.parse::<f32>() {
+        Ok(pull) if (0.0..=1000.0).contains(&pull) => Ok(pull),
+        _ => Err(format!("'{text}' is not between 0 and 1000")),
+    }
+}
 
 /// Steps by which the time of one is measured.
 const MEASURED_STEPS: u64 = 20;
@@ -29,7 +96,7 @@ const SAVE_EVERY: Duration = Duration::from_secs(30);
 const PICTURES: u64 = 10;
 
 /// Runs the command.
-pub fn build(args: &BuildArgs, gpu: &GpuContext) -> Result<()> {
+pub fn build(args: &AvatarBuildArgs, gpu: &GpuContext) -> Result<()> {
     let folder = args.out.parent().filter(|folder| !folder.as_os_str().is_empty()).unwrap_or(Path::new("."));
     ensure!(folder.is_dir(), "the folder {} does not exist; make it, or choose another --out", folder.display());
     let started = Instant::now();
@@ -66,18 +133,11 @@ pub fn build(args: &BuildArgs, gpu: &GpuContext) -> Result<()> {
         &avatar,
         frames,
         views,
-        FitSettings {
-            seed: args.seed,
-            pull: args.pull,
-            light: args.light,
-            refine_poses: args.refine_poses,
-            skin_correction: args.skin_correction,
-            weights: ErrorWeights { sharpness: args.sharpen, ..ErrorWeights::default() },
-            ..FitSettings::default()
-        },
+        FitSettings { seed: args.seed, pull: args.pull, light: args.light, ..FitSettings::default() },
     )?;
-    if args.method != Method::Direct {
-        let numbers = fit.use_networks(&mut avatar, &uvs, &local_settings(args.method, &args.local))?;
+    let local = LocalSettings::default();
+    if args.method == Method::LogAvatar {
+        let numbers = fit.use_networks(&mut avatar, &uvs, &local)?;
         println!("local networks of {numbers} numbers");
         picture(&avatar)?;
     }
@@ -126,7 +186,7 @@ pub fn build(args: &BuildArgs, gpu: &GpuContext) -> Result<()> {
     let training_db = fit.decibels(&avatar)?;
     avatar.card = Card {
         name: args.take.dataset.file_name().map_or_else(String::new, |name| name.to_string_lossy().into_owned()),
-        method: method(args),
+        method: method(args.method, &local),
         cameras: args.take.inputs.clone(),
         frames: numbers,
         pose: format!("{:?}", args.take.perception.pose).to_lowercase(),
@@ -150,31 +210,13 @@ pub fn build(args: &BuildArgs, gpu: &GpuContext) -> Result<()> {
     Ok(())
 }
 
-fn local_settings(method: Method, args: &LocalArgs) -> LocalSettings {
-    LocalSettings {
-        geometry: method != Method::LocalColors,
-        colors: method != Method::LocalGeometry,
-        group: args.group.into(),
-        stages: args.stages.into(),
-        layout: match args.atlas {
-            Atlas::Uv => AtlasLayout::Uv,
-            Atlas::FrontBack => AtlasLayout::FrontBack,
-        },
-        side: args.texels.into(),
-        ..LocalSettings::default()
-    }
-}
-
-/// The method, for the card.
-fn method(args: &BuildArgs) -> String {
-    let LocalArgs { group, stages, atlas, texels } = &args.local;
-    let geometry = format!("{group} Gaussians an anchor, {stages} stages");
-    let atlas = if *atlas == Atlas::Uv { "uv" } else { "front-back" };
-    let colors = format!("atlas {atlas} of {texels} texels");
-    match args.method {
+/// Describes the method, for the card.
+fn method(method: Method, local: &LocalSettings) -> String {
+    match method {
         Method::Direct => "gaussians".to_owned(),
-        Method::LogAvatar => format!("logavatar: {geometry}, {colors}"),
-        Method::LocalGeometry => format!("local geometry: {geometry}"),
-        Method::LocalColors => format!("local colors: {colors}"),
+        Method::LogAvatar => {
+            let LocalSettings { group, stages, side, .. } = local;
+            format!("logavatar: {group} Gaussians an anchor, {stages} stages, atlas uv of {side} texels")
+        }
     }
 }

@@ -6,7 +6,7 @@ use anyhow::{Context as _, Result};
 use flyrig_avatar::{Avatar, Fit, FitProgress};
 use flyrig_report::write_whole;
 
-use super::arguments::BuildArgs;
+use super::build::AvatarBuildArgs;
 
 /// Ending of the file.
 const ENDING: &str = "fit";
@@ -20,7 +20,7 @@ pub(super) struct Checkpoint {
 
 impl Checkpoint {
     /// Beside the avatar that is built from so many images.
-    pub fn new(args: &BuildArgs, images: usize) -> Self {
+    pub fn new(args: &AvatarBuildArgs, images: usize) -> Self {
         Self { path: args.out.with_extension(ENDING), settings: format!("{images} images, {args:?}") }
     }
 

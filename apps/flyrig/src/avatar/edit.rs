@@ -1,19 +1,49 @@
 //! `flyrig avatar edit`: another texture, another shape.
 
+use std::path::PathBuf;
+
 use anyhow::{Result, ensure};
+use clap::Args;
 use flyrig_body::ShapeParams;
 
-use super::{arguments::EditArgs, export::read_texture, load};
+use super::{
+    export::{TextureArgs, read_texture},
+    load,
+};
+
+/// Arguments of `flyrig avatar edit`.
+#[derive(Debug, Args)]
+pub struct AvatarEditArgs {
+    /// The avatar (*.flyavatar).
+    pub avatar: PathBuf,
+    /// The edited avatar to write (*.flyavatar).
+    #[arg(long)]
+    pub out: PathBuf,
+    /// A repainted texture of `flyrig avatar export --out TEXTURE.png`: texels that differ from the export are applied.
+    #[arg(long)]
+    pub texture: Option<PathBuf>,
+    /// Changes of shape NAME=VALUE relative to the average body, comma separated, such as stomach-tone=-0.8,upperarm-scale-vert=0.5.
+    #[arg(long, value_delimiter = ',', value_parser = parse_target)]
+    pub shape: Vec<(String, f32)>,
+    #[command(flatten)]
+    pub resolution: TextureArgs,
+}
+
+fn parse_target(text: &str) -> Result<(String, f32), String> {
+    let fail = || format!("'{text}' is not NAME=VALUE, such as stomach-tone=-0.8");
+    let (name, value) = text.split_once('=').ok_or_else(fail)?;
+    Ok((name.trim().to_owned(), value.trim().parse().map_err(|_| fail())?))
+}
 
 /// Runs the command.
-pub fn edit(args: &EditArgs) -> Result<()> {
+pub fn edit(args: &AvatarEditArgs) -> Result<()> {
     ensure!(
         args.texture.is_some() || !args.shape.is_empty(),
         "nothing to edit; give --texture or --shape (flyrig avatar edit --help)"
     );
     let mut avatar = load(&args.avatar)?;
     if let Some(path) = &args.texture {
-        let painted = avatar.paint(&read_texture(path, args.side)?)?;
+        let painted = avatar.paint(&read_texture(path, args.resolution.side)?)?;
         println!(
             "{} texels differ: {} Gaussians recoloured, {} added",
             painted.texels, painted.recolored, painted.added

@@ -1,8 +1,12 @@
 //! `flyrig avatar eval`: an avatar against held-out cameras.
 
-use std::time::{Duration, Instant};
+use std::{
+    path::PathBuf,
+    time::{Duration, Instant},
+};
 
 use anyhow::{Context as _, Result, ensure};
+use clap::Args;
 use flyrig_avatar::{Avatar, DetailedScene};
 use flyrig_fusion::{BodySettings, Outcome, PersonId, Solver};
 use flyrig_gpu::GpuContext;
@@ -10,7 +14,25 @@ use flyrig_metrics::{CameraScore, FrameScore, ScoreSheet, error_parts, score_vie
 use flyrig_report::{frame_number, png, progress_bar, write_whole};
 use serde::Serialize;
 
-use super::{arguments::EvalArgs, load, open_replay, parts::score_parts, print_far};
+use super::{load, open_replay, parts::score_parts, print_far};
+use crate::arguments::{DatasetArgs, HoldoutArgs};
+
+/// Arguments of `flyrig avatar eval`.
+#[derive(Debug, Args)]
+pub struct AvatarEvalArgs {
+    /// The avatar (*.flyavatar).
+    pub avatar: PathBuf,
+    #[command(flatten)]
+    pub take: DatasetArgs,
+    /// Folder of the images and scores.
+    #[arg(long)]
+    pub out: PathBuf,
+    /// Deform the clothes as tracked in the images, instead of driving the avatar by the pose alone.
+    #[arg(long)]
+    pub deformed: bool,
+    #[command(flatten)]
+    pub holdout: HoldoutArgs,
+}
 
 #[derive(Debug, Serialize)]
 struct Metrics<'a> {
@@ -34,7 +56,7 @@ struct Metrics<'a> {
 }
 
 /// Runs the command.
-pub fn eval(args: &EvalArgs, gpu: &GpuContext) -> Result<()> {
+pub fn eval(args: &AvatarEvalArgs, gpu: &GpuContext) -> Result<()> {
     let avatar = load(&args.avatar)?;
     let nodes = avatar.hanging.as_ref().map_or(1, |hanging| hanging.nodes.len());
     let body = BodySettings { gaussians: avatar.gaussians(), nodes, ..BodySettings::default() };
@@ -42,13 +64,13 @@ pub fn eval(args: &EvalArgs, gpu: &GpuContext) -> Result<()> {
     if !args.deformed {
         take.tracking.solver = Solver::None;
     }
-    let mut replay = open_replay(&take, &args.holdout, (&body, Some(&avatar.template)), gpu)?;
+    let mut replay = open_replay(&take, &args.holdout.holdout, (&body, Some(&avatar.template)), gpu)?;
     let holdout = replay.holdout.clone();
     for camera in &holdout {
         let folder = args.out.join(camera.id.as_str());
         std::fs::create_dir_all(&folder).with_context(|| format!("cannot create {}", folder.display()))?;
     }
-    let mut scene = DetailedScene::new(gpu, avatar, args.level_of_detail)?;
+    let mut scene = DetailedScene::new(gpu, avatar, true)?;
     let gaussians = scene.avatar().gaussians();
     let bar = progress_bar(replay.count as u64, "avatar eval");
     let (mut sheet, mut spent, mut views_drawn) = (ScoreSheet::default(), Duration::ZERO, 0u32);
@@ -100,7 +122,7 @@ pub fn eval(args: &EvalArgs, gpu: &GpuContext) -> Result<()> {
     let metrics = Metrics {
         avatar: args.avatar.display().to_string(),
         inputs: &args.take.inputs,
-        holdout: &args.holdout,
+        holdout: &args.holdout.holdout,
         deformed: args.deformed,
         gaussians,
         mean_drawn,

@@ -1,9 +1,10 @@
 //! `flyrig avatar export`: an avatar for other programs.
 
-use std::path::Path;
+use std::path::{Path, PathBuf};
 
 use anyhow::{Context as _, Result, bail, ensure};
-use flyrig_avatar::{Atlas, Avatar, Bones, PosedAvatar, write_splat_glb};
+use clap::Args;
+use flyrig_avatar::{Atlas, Avatar, Bones, DEFAULT_ATLAS_SIDE, PosedAvatar, write_splat_glb};
 use flyrig_body::{GlbContents, write_glb};
 use flyrig_renderer::{AnisotropicSplats, write_anisotropic_ply};
 use flyrig_report::{png, write_whole};
@@ -11,13 +12,41 @@ use flyrig_types::PoseTrack;
 use glam::{DQuat, Quat};
 
 use super::{
-    arguments::ExportArgs,
     load,
     render::{motion, pose_at},
 };
 
+/// Arguments of `flyrig avatar export`.
+#[derive(Debug, Args)]
+pub struct AvatarExportArgs {
+    /// The avatar (*.flyavatar).
+    pub avatar: PathBuf,
+    /// The file to write: splats as *.ply, or as *.glb (KHR_gaussian_splatting); the texture as *.png.
+    #[arg(long)]
+    pub out: PathBuf,
+    /// Write a textured mesh with bones (*.glb) instead of splats, animated by --motion.
+    #[arg(long)]
+    pub mesh: bool,
+    /// Motion that poses it (BVH or glTF); the rest pose otherwise.
+    #[arg(long)]
+    pub motion: Option<PathBuf>,
+    /// Frame of the motion for splats, at 30 per second.
+    #[arg(long, default_value_t = 0)]
+    pub frame: u64,
+    #[command(flatten)]
+    pub resolution: TextureArgs,
+}
+
+/// Resolution of a texture.
+#[derive(Debug, Args)]
+pub struct TextureArgs {
+    /// Texels along a side of the texture.
+    #[arg(long, default_value_t = DEFAULT_ATLAS_SIDE)]
+    pub side: u32,
+}
+
 /// Runs the command.
-pub fn export(args: &ExportArgs) -> Result<()> {
+pub fn export(args: &AvatarExportArgs) -> Result<()> {
     let avatar = load(&args.avatar)?;
     let ending = args.out.extension().map(|ending| ending.to_string_lossy().to_lowercase()).unwrap_or_default();
     ensure!(
@@ -33,8 +62,8 @@ pub fn export(args: &ExportArgs) -> Result<()> {
     }
 }
 
-fn texture(avatar: &Avatar, args: &ExportArgs) -> Result<()> {
-    let atlas = avatar.atlas(args.side)?;
+fn texture(avatar: &Avatar, args: &AvatarExportArgs) -> Result<()> {
+    let atlas = avatar.atlas(args.resolution.side)?;
     write_whole(&args.out, &encode(&atlas)?)?;
     println!(
         "texture of {0} x {0} texels, {1} of them on the body, in {2}; paint it, then: flyrig avatar edit {3} --texture {2} --out NEW.flyavatar",
@@ -50,8 +79,8 @@ fn encode(atlas: &Atlas) -> Result<Vec<u8>> {
     png::encode_rgb(&atlas.rgb, atlas.side, atlas.side)
 }
 
-fn mesh(avatar: &Avatar, args: &ExportArgs) -> Result<()> {
-    let texture = encode(&avatar.atlas(args.side)?)?;
+fn mesh(avatar: &Avatar, args: &AvatarExportArgs) -> Result<()> {
+    let texture = encode(&avatar.atlas(args.resolution.side)?)?;
     let track = args.motion.as_deref().map(|path| y_up(&motion(avatar, path)?)).transpose()?;
     write_glb(&args.out, &avatar.template, GlbContents { track: track.as_ref(), texture: Some(&texture) })?;
     let (vertices, joints) = (avatar.template.positions.len(), avatar.template.skeleton.joints().len());
@@ -73,7 +102,7 @@ fn y_up(track: &PoseTrack) -> Result<PoseTrack> {
     Ok(PoseTrack::new(turned.collect())?)
 }
 
-fn splats(avatar: &Avatar, args: &ExportArgs, ending: &str) -> Result<()> {
+fn splats(avatar: &Avatar, args: &AvatarExportArgs, ending: &str) -> Result<()> {
     let pose = match &args.motion {
         Some(path) => pose_at(&motion(avatar, path)?, args.frame),
         None => avatar.template.skeleton.rest_pose(),

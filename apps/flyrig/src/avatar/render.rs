@@ -1,16 +1,42 @@
 //! `flyrig avatar render`: an avatar driven by a recorded motion.
 
-use std::path::Path;
+use std::{
+    ops::Range,
+    path::{Path, PathBuf},
+};
 
 use anyhow::{Context as _, Result, bail};
+use clap::Args;
 use flyrig_avatar::{Avatar, DetailedScene};
 use flyrig_body::{RetargetOptions, load_bvh, load_gltf};
 use flyrig_gpu::GpuContext;
-use flyrig_report::{png, progress_bar, stop};
+use flyrig_report::{
+    arguments::{parse_range, parse_size},
+    png, progress_bar, stop,
+};
 use flyrig_types::{Camera, Intrinsics, Isometry, Lens, Pose, PoseTrack};
 use glam::{DQuat, DVec2, DVec3};
 
-use super::{arguments::RenderArgs, load, print_far};
+use super::{load, print_far};
+
+/// Arguments of `flyrig avatar render`.
+#[derive(Debug, Args)]
+pub struct AvatarRenderArgs {
+    /// The avatar (*.flyavatar).
+    pub avatar: PathBuf,
+    /// Recorded motion: BVH or animated glTF.
+    #[arg(long)]
+    pub motion: PathBuf,
+    /// Folder of the images.
+    #[arg(long)]
+    pub out: PathBuf,
+    /// Frames of the motion FIRST..END, END excluded, at 30 per second.
+    #[arg(long, default_value = "0..30", value_parser = parse_range)]
+    pub frames: Range<u64>,
+    /// Size of the images, pixels.
+    #[arg(long, default_value = "512x768", value_parser = parse_size)]
+    pub size: [u32; 2],
+}
 
 /// Frames a second of the images.
 pub(super) const FPS: f64 = 30.0;
@@ -19,11 +45,11 @@ const AWAY_M: f64 = 3.6;
 const HEIGHT_M: f64 = 1.1;
 
 /// Runs `render`.
-pub fn render(args: &RenderArgs, gpu: &GpuContext) -> Result<()> {
+pub fn render(args: &AvatarRenderArgs, gpu: &GpuContext) -> Result<()> {
     let avatar = load(&args.avatar)?;
     let track = motion(&avatar, &args.motion)?;
     std::fs::create_dir_all(&args.out).with_context(|| format!("cannot create {}", args.out.display()))?;
-    let mut scene = DetailedScene::new(gpu, avatar, args.level_of_detail)?;
+    let mut scene = DetailedScene::new(gpu, avatar, true)?;
     let bar = progress_bar(args.frames.end - args.frames.start, "avatar render");
     let (mut far, mut drawn) = (0.0, 0);
     for frame in args.frames.clone() {

@@ -1,6 +1,7 @@
 //! `flyrig calibrate color`: colours of the cameras, matched by people whom several of them see.
 
 use anyhow::{Context as _, Result, ensure};
+use clap::Args;
 use flyrig_body::{ShapeParams, default_template};
 use flyrig_calib::{CameraColors, ColorFit, ColorPoint, ColorSample, match_colors, save_calibration};
 use flyrig_fusion::{
@@ -15,9 +16,26 @@ use serde_json::json;
 
 use super::{FILES, refuse_existing};
 use crate::{
-    cli::CalibrateColorArgs,
+    arguments::{CalibrationArgs, InputArgs, SpanArgs, TargetArgs},
     take::{self, CalibratedTake},
 };
+
+/// Arguments of `flyrig calibrate color`.
+#[derive(Debug, Args)]
+#[command(mut_arg("secs", |arg| arg.default_value("10")))]
+pub struct CalibrateColorArgs {
+    /// Largest number of tracked people.
+    #[arg(long, default_value_t = 1)]
+    pub people: usize,
+    #[command(flatten)]
+    pub source: InputArgs,
+    #[command(flatten)]
+    pub calibration: CalibrationArgs,
+    #[command(flatten)]
+    pub span: SpanArgs,
+    #[command(flatten)]
+    pub target: TargetArgs,
+}
 
 /// Gaussians on a person: enough for colours, in a quarter of the time.
 const GAUSSIANS: usize = 30_000;
@@ -40,8 +58,10 @@ const MOST_HALVES: f64 = 0.03;
 /// Runs the command.
 pub fn color(args: &CalibrateColorArgs, gpu: &dyn Fn() -> Result<GpuContext>) -> Result<()> {
     stop::flag();
-    refuse_existing(&args.out, &FILES, args.force)?;
-    let open = || take::open_calibrated(&args.input, args.fps, args.calibration.as_deref(), gpu);
+    refuse_existing(&args.target.out, &FILES, args.target.force)?;
+    let open = || {
+        take::open_calibrated(&args.source.input, args.source.rate.fps, args.calibration.calibration.as_deref(), gpu)
+    };
     let mut take = open()?;
     ensure!(
         !take.is_live,
@@ -79,17 +99,18 @@ pub fn color(args: &CalibrateColorArgs, gpu: &dyn Fn() -> Result<GpuContext>) ->
     }
     rig.validate().context("the colours cannot be matched; are the exposures of the cameras alike?")?;
     print(&ids, &fit);
-    std::fs::create_dir_all(&args.out).with_context(|| format!("cannot create {}", args.out.display()))?;
-    save_calibration(&args.out, &rig, &[])?;
-    write_whole(&args.out.join("calibration.json"), &serde_json::to_vec_pretty(&report(&ids, &fit))?)?;
-    println!("{}: {}", args.out.display(), FILES.join(", "));
-    println!("next: set path (of a folder: calibration) = \"{}\" in [source]", args.out.display());
+    std::fs::create_dir_all(&args.target.out)
+        .with_context(|| format!("cannot create {}", args.target.out.display()))?;
+    save_calibration(&args.target.out, &rig, &[])?;
+    write_whole(&args.target.out.join("calibration.json"), &serde_json::to_vec_pretty(&report(&ids, &fit))?)?;
+    println!("{}: {}", args.target.out.display(), FILES.join(", "));
+    println!("next: set path (of a folder: calibration) = \"{}\" in [source]", args.target.out.display());
     Ok(())
 }
 
 /// Returns sets of the first seconds, from which shapes are measured.
 fn first_sets(args: &CalibrateColorArgs, rig: &Rig, take: CalibratedTake) -> Result<Vec<FrameSet>> {
-    let secs = [args.from_secs, args.from_secs + SHAPE_SECS];
+    let secs = [args.span.from_secs, args.span.from_secs + SHAPE_SECS];
     let (mut sets, mut first): (Vec<FrameSet>, _) = (Vec::new(), None);
     take::each_set(take.sources, rig, take.sync, 0, secs, "the person's shape, ms of the take", |set| {
         let from = *first.get_or_insert(set.master_nanos);
@@ -109,7 +130,7 @@ fn look_through(
     session: &mut Session,
     take: CalibratedTake,
 ) -> Result<Vec<ColorPoint>> {
-    let secs = [args.from_secs, args.from_secs + args.secs];
+    let secs = [args.span.from_secs, args.span.from_secs + args.span.secs];
     let (mut points, mut sets) = (Vec::new(), 0u64);
     let errors = take::each_set(take.sources, rig, take.sync, 0, secs, "colours, ms of the take", |set| {
         session.process(set)?;

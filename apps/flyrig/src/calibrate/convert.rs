@@ -1,12 +1,50 @@
 //! `flyrig calibrate convert`: calibrations of other programs.
 
+use std::path::PathBuf;
+
 use anyhow::{Context as _, Result, bail, ensure};
+use clap::Args;
 use flyrig_calib::{Format, save_lenses};
 use flyrig_capture::folder_image_size;
 use flyrig_types::ColorMatch;
 
 use super::refuse_existing;
-use crate::cli::CalibrateConvertArgs;
+use crate::arguments::TargetArgs;
+
+/// Arguments of `flyrig calibrate convert`.
+#[derive(Debug, Args)]
+pub struct CalibrateConvertArgs {
+    /// File or folder of the other program; see --from.
+    pub input: PathBuf,
+    /// Format of the input, recognized by file names otherwise: flyrig, easymocap, opencv, kalibr, colmap, nerfstudio, qualisys,
+    /// anipose (Pose2Sim and caliscope too), mrcal.
+    #[arg(long, value_parser = parse_format)]
+    pub from: Option<Format>,
+    /// Format of the output, one of those of --from.
+    #[arg(long, value_parser = parse_format, default_value = "flyrig")]
+    pub to: Format,
+    /// Length of the unit of the input, metres: 0.001 for millimetres; the measured length for COLMAP and nerfstudio, whose unit is arbitrary.
+    #[arg(long, default_value_t = 1.0, value_parser = parse_scale)]
+    pub scale: f64,
+    /// Folder with images/CAM, for formats without the size of the images; the input otherwise.
+    #[arg(long)]
+    pub images: Option<PathBuf>,
+    #[command(flatten)]
+    pub target: TargetArgs,
+}
+
+fn parse_format(text: &str) -> Result<Format, String> {
+    let known = Format::ALL.map(Format::name);
+    Format::ALL
+        .into_iter()
+        .find(|format| format.name() == text)
+        .ok_or_else(|| format!("no such format; known: {}", known.join(", ")))
+}
+
+fn parse_scale(text: &str) -> Result<f64, String> {
+    let scale = text.parse().ok().filter(|scale| (1e-9..=1e9).contains(scale));
+    scale.ok_or_else(|| "expected metres of a unit, between 1e-9 and 1e9".to_owned())
+}
 
 /// Runs the command.
 pub fn convert(args: &CalibrateConvertArgs) -> Result<()> {
@@ -24,22 +62,23 @@ pub fn convert(args: &CalibrateConvertArgs) -> Result<()> {
         Format::EasyMocap => vec!["intri.yml", "extri.yml"],
         _ => Vec::new(),
     };
-    refuse_existing(&args.out, &names, args.force)?;
+    refuse_existing(&args.target.out, &names, args.target.force)?;
     ensure!(
-        args.force || !names.is_empty() || !args.out.exists(),
+        args.target.force || !names.is_empty() || !args.target.out.exists(),
         "{} is there already; name a new folder, or replace its files with --force",
-        args.out.display()
+        args.target.out.display()
     );
-    std::fs::create_dir_all(&args.out).with_context(|| format!("cannot create {}", args.out.display()))?;
+    std::fs::create_dir_all(&args.target.out)
+        .with_context(|| format!("cannot create {}", args.target.out.display()))?;
     println!("from {}: {}", from.name(), from.conventions());
     println!("to {}: {}", args.to.name(), args.to.conventions());
     let Some(rig) = rig else {
         if args.to != Format::Flyrig {
             bail!("{} holds lenses without poses; they can be written as flyrig's alone", input.display());
         }
-        save_lenses(&args.out, &imported.lenses())?;
-        println!("{}: calibration.toml with lenses alone", args.out.display());
-        println!("next: flyrig calibrate rig TAKE --lenses {}", args.out.display());
+        save_lenses(&args.target.out, &imported.lenses())?;
+        println!("{}: calibration.toml with lenses alone", args.target.out.display());
+        println!("next: flyrig calibrate rig TAKE --lenses {}", args.target.out.display());
         return Ok(());
     };
     for camera in &rig.cameras {
@@ -68,7 +107,7 @@ pub fn convert(args: &CalibrateConvertArgs) -> Result<()> {
         println!("warning: {} has no place for colour corrections; they are left out", args.to.name());
     }
     // A folder that stays empty goes again.
-    let files = args.to.write(&args.out, &rig).inspect_err(|_| drop(std::fs::remove_dir(&args.out)))?;
-    println!("{}: {}", args.out.display(), files.join(", "));
+    let files = args.to.write(&args.target.out, &rig).inspect_err(|_| drop(std::fs::remove_dir(&args.target.out)))?;
+    println!("{}: {}", args.target.out.display(), files.join(", "));
     Ok(())
 }

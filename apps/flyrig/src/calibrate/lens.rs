@@ -1,13 +1,28 @@
 //! `flyrig calibrate lens`: the lenses of cameras, each by itself.
 
 use anyhow::{Context as _, Result};
+use clap::Args;
 use flyrig_calib::{Board, LensFit, calibrate_lens, save_lenses};
 use flyrig_gpu::GpuContext;
 use flyrig_report::stop;
 use flyrig_types::{CameraId, Intrinsics};
 
-use super::{refuse_existing, views::Seen};
-use crate::cli::CalibrateLensArgs;
+use super::{
+    refuse_existing,
+    views::{Seen, TakeArgs},
+};
+use crate::arguments::{BoardArgs, TargetArgs};
+
+/// Arguments of `flyrig calibrate lens`.
+#[derive(Debug, Args)]
+pub struct CalibrateLensArgs {
+    #[command(flatten)]
+    pub take: TakeArgs,
+    #[command(flatten)]
+    pub board: BoardArgs,
+    #[command(flatten)]
+    pub target: TargetArgs,
+}
 
 /// Coverage below which edges of the image are guesses.
 const GOOD_COVERAGE: f64 = 0.6;
@@ -15,14 +30,15 @@ const GOOD_COVERAGE: f64 = 0.6;
 /// Runs the command.
 pub fn lens(args: &CalibrateLensArgs, gpu: &dyn Fn() -> Result<GpuContext>) -> Result<()> {
     stop::flag();
-    let board = Board::load(&args.board)?;
-    refuse_existing(&args.out, &["calibration.toml"], args.force)?;
+    let board = Board::load(&args.board.board)?;
+    refuse_existing(&args.target.out, &["calibration.toml"], args.target.force)?;
     let seen = Seen::find(&args.take, &board, gpu)?;
     let lenses = solve(&board, &seen)?;
-    std::fs::create_dir_all(&args.out).with_context(|| format!("cannot create {}", args.out.display()))?;
-    save_lenses(&args.out, &lenses)?;
-    println!("{}: calibration.toml with lenses alone", args.out.display());
-    println!("next: flyrig calibrate rig TAKE --lenses {}", args.out.display());
+    std::fs::create_dir_all(&args.target.out)
+        .with_context(|| format!("cannot create {}", args.target.out.display()))?;
+    save_lenses(&args.target.out, &lenses)?;
+    println!("{}: calibration.toml with lenses alone", args.target.out.display());
+    println!("next: flyrig calibrate rig TAKE --lenses {}", args.target.out.display());
     Ok(())
 }
 

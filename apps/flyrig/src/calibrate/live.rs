@@ -9,6 +9,7 @@ use std::{
 };
 
 use anyhow::{Result, ensure};
+use clap::Args;
 use flyrig_calib::{Board, BoardShot, CalibError, RigFit, RigOptions, calibrate_lens, calibrate_rig, load_lenses};
 use flyrig_gpu::GpuContext;
 use flyrig_monitor::PageServer;
@@ -21,12 +22,37 @@ use super::{
     advice::{Progress, Step, different},
     page, refuse_existing,
     rig::{self, PAGE, Target},
-    views::Seen,
+    views::{Seen, TakeArgs},
 };
 use crate::{
-    cli::{CalibrateLiveArgs, TakeArgs},
+    arguments::{BoardArgs, SolveArgs, TargetArgs},
     take,
 };
+
+/// Arguments of `flyrig calibrate live`.
+#[derive(Debug, Args)]
+#[command(mut_arg("secs", |arg| arg.default_value("1800")))]
+pub struct CalibrateLiveArgs {
+    /// Precision at which the calibration ends: standard deviation of every camera in the middle of the boards, millimetres.
+    #[arg(long, default_value_t = 1.0, value_parser = parse_target_mm)]
+    pub target_mm: f64,
+    /// Address of the page; 0.0.0.0:8090 makes it reachable for other computers and phones.
+    #[arg(long, default_value = "127.0.0.1:8090")]
+    pub listen: String,
+    #[command(flatten)]
+    pub take: TakeArgs,
+    #[command(flatten)]
+    pub board: BoardArgs,
+    #[command(flatten)]
+    pub solve: SolveArgs,
+    #[command(flatten)]
+    pub target: TargetArgs,
+}
+
+fn parse_target_mm(text: &str) -> Result<f64, String> {
+    let target = text.parse().ok().filter(|target| (0.01..=1000.0).contains(target));
+    target.ok_or_else(|| "expected millimetres, between 0.01 and 1000".to_owned())
+}
 
 /// Time between two looks at what is missing, and between two solves.
 const LOOK_EVERY: Duration = Duration::from_millis(500);
@@ -41,23 +67,22 @@ const NEW_BOARDS: usize = 4;
 /// Runs the command.
 pub fn live(args: &CalibrateLiveArgs, gpu: &dyn Fn() -> Result<GpuContext>) -> Result<()> {
     stop::flag();
-    let board = Board::load(&args.board)?;
-    refuse_existing(&args.out, &[&FILES[..], &[PAGE]].concat(), args.force)?;
-    let take_args = TakeArgs { input: args.input.clone(), secs: args.secs, every_ms: args.every_ms, fps: args.fps };
-    let opened = take::open(&take_args.input, take_args.fps, gpu)?;
+    let board = Board::load(&args.board.board)?;
+    refuse_existing(&args.target.out, &[&FILES[..], &[PAGE]].concat(), args.target.force)?;
+    let opened = take::open(&args.take.source.input, args.take.source.rate.fps, gpu)?;
     let ids: Vec<CameraId> = opened.sources.iter().map(|source| source.camera().clone()).collect();
     ensure!(ids.len() > 1, "one camera alone is no rig; flyrig calibrate lens calibrates it");
     let server = PageServer::start("--listen", &args.listen, "text/html; charset=utf-8")?;
     eprintln!("calibrate live: progress at http://{}/ (Ctrl-C calibrates with what was seen)", server.address());
     let mut watching = Watching::new(args, board.clone(), server);
-    let mut seen = Seen::look_through(opened, &board, &take_args, |seen, _| watching.look(seen))?;
+    let mut seen = Seen::look_through(opened, &board, &args.take, |seen, _| watching.look(seen))?;
     watching.show.finish_and_clear();
     different(&seen.shots, watching.looked_at, &seen.sizes, &mut watching.shots);
     seen.shots = watching.shots;
     seen.check(&board)?;
-    rig::check_floor(args.floor, &seen)?;
-    let lenses = rig::lenses(args.lenses.as_deref(), &board, &seen)?;
-    let target = Target { out: &args.out, floor: args.floor, no_offsets: args.no_offsets };
+    rig::check_floor(args.solve.floor, &seen)?;
+    let lenses = rig::lenses(args.solve.lenses.as_deref(), &board, &seen)?;
+    let target = Target { out: &args.target.out, floor: args.solve.floor, no_offsets: args.solve.no_offsets };
     rig::solve_and_write(&target, &board, &seen, &lenses, None)
 }
 
@@ -109,7 +134,7 @@ impl<'a> Watching<'a> {
         }
         self.last_look = Some(Instant::now());
         if self.shots.is_empty() && !seen.shots.is_empty() {
-            rig::check_floor(self.args.floor, seen)?;
+            rig::check_floor(self.args.solve.floor, seen)?;
         }
         different(&seen.shots, self.looked_at, &seen.sizes, &mut self.shots);
         self.looked_at = seen.shots.len();
@@ -121,7 +146,7 @@ impl<'a> Watching<'a> {
             ids: &seen.ids,
             sizes: &seen.sizes,
             shots: &self.shots,
-            with_lenses: self.args.lenses.is_none(),
+            with_lenses: self.args.solve.lenses.is_none(),
             solved: self.solved.as_ref(),
             target_mm: self.args.target_mm,
         };
@@ -158,7 +183,7 @@ impl<'a> Watching<'a> {
         // The first one may lie on the floor.
         let shots: Vec<BoardShot> = self.shots.iter().step_by(every).cloned().collect();
         let (ids, sizes, board) = (seen.ids.clone(), seen.sizes.clone(), self.board.clone());
-        let (lenses, floor_first) = (self.args.lenses.clone(), self.args.floor);
+        let (lenses, floor_first) = (self.args.solve.lenses.clone(), self.args.solve.floor);
         let work = move || {
             let known = match &lenses {
                 Some(folder) => load_lenses(folder, &|_| None)?,

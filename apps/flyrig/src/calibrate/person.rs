@@ -1,6 +1,7 @@
 //! `flyrig calibrate person`: better poses and time offsets of cameras from one person who moves.
 
 use anyhow::{Context as _, Result, ensure};
+use clap::Args;
 use flyrig_body::{ShapeParams, default_template};
 use flyrig_calib::{
     Deviation, OutlineCorner, PersonCamera, PersonFit, PersonOptions, PersonTracks, calibrate_person, save_calibration,
@@ -15,9 +16,25 @@ use serde_json::json;
 
 use super::{FILES, refuse_existing};
 use crate::{
-    cli::CalibratePersonArgs,
+    arguments::{CalibrationArgs, InputArgs, SpanArgs, TargetArgs},
     take::{self, CalibratedTake},
 };
+
+/// Arguments of `flyrig calibrate person`.
+#[derive(Debug, Args)]
+pub struct CalibratePersonArgs {
+    /// Take the cameras' stamps as they are.
+    #[arg(long)]
+    pub no_offsets: bool,
+    #[command(flatten)]
+    pub source: InputArgs,
+    #[command(flatten)]
+    pub calibration: CalibrationArgs,
+    #[command(flatten)]
+    pub span: SpanArgs,
+    #[command(flatten)]
+    pub target: TargetArgs,
+}
 
 /// Landmarks in use, by their index in the network: nose, eyes, ears, shoulders to wrists, index fingers, hips to toes.
 const LANDMARKS: [usize; 23] = [0, 2, 5, 7, 8, 11, 12, 13, 14, 15, 16, 19, 20, 23, 24, 25, 26, 27, 28, 29, 30, 31, 32];
@@ -60,8 +77,9 @@ const CONFIDENCE: f64 = 0.3;
 /// Runs the command.
 pub fn person(args: &CalibratePersonArgs, gpu: &dyn Fn() -> Result<GpuContext>) -> Result<()> {
     stop::flag();
-    refuse_existing(&args.out, &FILES, args.force)?;
-    let mut take = take::open_calibrated(&args.input, args.fps, args.calibration.as_deref(), gpu)?;
+    refuse_existing(&args.target.out, &FILES, args.target.force)?;
+    let mut take =
+        take::open_calibrated(&args.source.input, args.source.rate.fps, args.calibration.calibration.as_deref(), gpu)?;
     ensure!(
         !take.is_live,
         "live cameras cannot be looked at frame by frame; record them first (flyrig record) and give the recording"
@@ -102,15 +120,16 @@ pub fn person(args: &CalibratePersonArgs, gpu: &dyn Fn() -> Result<GpuContext>) 
             println!("take camera {} out of [sync] lags_ms: that replaces the offset of calibration.toml", camera.id);
         }
     }
-    std::fs::create_dir_all(&args.out).with_context(|| format!("cannot create {}", args.out.display()))?;
+    std::fs::create_dir_all(&args.target.out)
+        .with_context(|| format!("cannot create {}", args.target.out.display()))?;
     let deviation = |camera: &PersonCamera| {
         let (rotation_deg, position_mm) = camera.deviation;
         let time_offset_ms = options.lags.then_some(1e3 * camera.lag_s.1);
         Some(Deviation { rotation_deg, position_mm, time_offset_ms })
     };
-    save_calibration(&args.out, &better, &fit.cameras.iter().map(deviation).collect::<Vec<_>>())?;
-    write_whole(&args.out.join("calibration.json"), &serde_json::to_vec_pretty(&report(&rig, &fit))?)?;
-    println!("{}: {}", args.out.display(), FILES.join(", "));
+    save_calibration(&args.target.out, &better, &fit.cameras.iter().map(deviation).collect::<Vec<_>>())?;
+    write_whole(&args.target.out.join("calibration.json"), &serde_json::to_vec_pretty(&report(&rig, &fit))?)?;
+    println!("{}: {}", args.target.out.display(), FILES.join(", "));
     Ok(())
 }
 
@@ -124,7 +143,7 @@ fn look_through(
     let template = default_template(&ShapeParams::default())?;
     let mut viewers = Viewers::new(&PoseNet::embedded()?, &template, rig, plates, &PoseConfig::default())?;
     let mut tracks = PersonTracks::new(rig.cameras.len(), LANDMARKS.len());
-    let secs = [args.from_secs, args.from_secs + args.secs];
+    let secs = [args.span.from_secs, args.span.from_secs + args.span.secs];
     let errors = take::each_set(take.sources, rig, take.sync, 0, secs, "the person, ms of the take", |set| {
         for (slot, found) in viewers.estimate(set)?.into_iter().enumerate() {
             let (Some(found), Some(frame)) = (found, &set.frames[slot]) else { continue };

@@ -3,6 +3,7 @@
 use std::path::Path;
 
 use anyhow::{Context as _, Result, ensure};
+use clap::Args;
 use flyrig_calib::{Board, Deviation, LensModel, RigFit, RigOptions, calibrate_rig, load_lenses, save_calibration};
 use flyrig_gpu::GpuContext;
 use flyrig_report::{stop, write_whole};
@@ -10,8 +11,27 @@ use flyrig_types::Intrinsics;
 use glam::DVec3;
 use serde_json::json;
 
-use super::{FILES, lens, page, refuse_existing, views::Seen};
-use crate::cli::CalibrateRigArgs;
+use super::{
+    FILES, lens, page, refuse_existing,
+    views::{Seen, TakeArgs},
+};
+use crate::arguments::{BoardArgs, SolveArgs, TargetArgs};
+
+/// Arguments of `flyrig calibrate rig`.
+#[derive(Debug, Args)]
+pub struct CalibrateRigArgs {
+    #[command(flatten)]
+    pub take: TakeArgs,
+    /// Optimize the lenses together with the poses.
+    #[arg(long)]
+    pub refine_lenses: bool,
+    #[command(flatten)]
+    pub board: BoardArgs,
+    #[command(flatten)]
+    pub solve: SolveArgs,
+    #[command(flatten)]
+    pub target: TargetArgs,
+}
 
 /// Name of the page about the calibration.
 pub(super) const PAGE: &str = "calibration.html";
@@ -37,14 +57,14 @@ pub(super) struct Target<'a> {
 /// Runs the command.
 pub fn rig(args: &CalibrateRigArgs, gpu: &dyn Fn() -> Result<GpuContext>) -> Result<()> {
     stop::flag();
-    let board = Board::load(&args.board)?;
-    refuse_existing(&args.out, &[&FILES[..], &[PAGE]].concat(), args.force)?;
+    let board = Board::load(&args.board.board)?;
+    refuse_existing(&args.target.out, &[&FILES[..], &[PAGE]].concat(), args.target.force)?;
     let seen = Seen::find(&args.take, &board, gpu)?;
     ensure!(seen.ids.len() > 1, "one camera alone is no rig; flyrig calibrate lens calibrates it");
-    check_floor(args.floor, &seen)?;
-    let lenses = lenses(args.lenses.as_deref(), &board, &seen)?;
+    check_floor(args.solve.floor, &seen)?;
+    let lenses = lenses(args.solve.lenses.as_deref(), &board, &seen)?;
     let refine = args.refine_lenses.then_some(LensModel::RadialTangential);
-    let target = Target { out: &args.out, floor: args.floor, no_offsets: args.no_offsets };
+    let target = Target { out: &args.target.out, floor: args.solve.floor, no_offsets: args.solve.no_offsets };
     solve_and_write(&target, &board, &seen, &lenses, refine)
 }
 

@@ -7,18 +7,32 @@ use std::{
 };
 
 use anyhow::{Result, anyhow, ensure};
+use clap::Args;
 use flyrig_calib::{Board, BoardDetector, BoardShot, BoardView, GrayImage, detector};
 use flyrig_fusion::{InputFormat, Intake};
 use flyrig_gpu::GpuContext;
-use flyrig_report::{progress_bar, stop};
+use flyrig_report::{arguments::parse_seconds, progress_bar, stop};
 use flyrig_sync::SyncSettings;
 use flyrig_types::{CameraId, FrameSet};
 use rayon::prelude::*;
 
 use crate::{
-    cli::TakeArgs,
+    arguments::{InputArgs, parse_most_ms},
     take::{self, Take},
 };
+
+/// A take of a board, and the part that is used.
+#[derive(Debug, Args)]
+pub struct TakeArgs {
+    /// Seconds of the input that are used.
+    #[arg(long, default_value_t = 120.0, value_parser = parse_seconds)]
+    pub secs: f64,
+    /// Time between used frame sets, milliseconds.
+    #[arg(long, default_value_t = 100.0, value_parser = parse_most_ms)]
+    pub every_ms: f64,
+    #[command(flatten)]
+    pub source: InputArgs,
+}
 
 /// Images that are looked at together.
 const BATCH: usize = 16;
@@ -43,11 +57,12 @@ impl Seen {
     /// Opens a take and looks for the board; every camera must see it. `gpu` opens a graphics adapter, for simulated cameras alone.
     pub fn find(args: &TakeArgs, board: &Board, gpu: &dyn Fn() -> Result<GpuContext>) -> Result<Self> {
         let bar = progress_bar((args.secs * 1e3) as u64, "boards, ms of the take");
-        let seen = Self::look_through(take::open(&args.input, args.fps, gpu)?, board, args, |seen, at| {
-            bar.set_position((at * 1e3) as u64);
-            bar.set_message(format!("{} boards", seen.shots.iter().map(|shot| shot.views.len()).sum::<usize>()));
-            Ok(ControlFlow::Continue(()))
-        })?;
+        let seen =
+            Self::look_through(take::open(&args.source.input, args.source.rate.fps, gpu)?, board, args, |seen, at| {
+                bar.set_position((at * 1e3) as u64);
+                bar.set_message(format!("{} boards", seen.shots.iter().map(|shot| shot.views.len()).sum::<usize>()));
+                Ok(ControlFlow::Continue(()))
+            })?;
         bar.finish_and_clear();
         seen.check(board)?;
         Ok(seen)

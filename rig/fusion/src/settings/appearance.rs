@@ -16,15 +16,19 @@ pub enum AppearanceMode {
     /// Projection, spatial diffusion and temporal memory.
     #[default]
     Direct,
-    /// `direct` without the temporal memory.
+    /// Ablation without the temporal memory.
+    #[value(hide = true)]
     DirectNoTime,
-    /// Projection only, as the paper's "w/o ST" baseline.
+    /// Ablation with projection only, the paper's "w/o ST" baseline.
+    #[value(hide = true)]
     DirectNoSpaceTime,
     /// `direct`, and the corrections of trained networks.
     Stfa,
-    /// `stfa` without the temporal memory.
+    /// Ablation of `stfa` without the temporal memory.
+    #[value(hide = true)]
     StfaNoTime,
-    /// `stfa` without graph and memory.
+    /// Ablation of `stfa` without graph and memory.
+    #[value(hide = true)]
     StfaNoSpaceTime,
 }
 
@@ -38,6 +42,12 @@ impl AppearanceMode {
             Self::DirectNoSpaceTime | Self::StfaNoSpaceTime => (false, false),
         };
         AppearanceSettings { space, time, ..AppearanceSettings::default() }
+    }
+
+    /// Returns whether the mode leaves parts of the method out, for measurements only.
+    #[must_use]
+    pub fn is_ablation(self) -> bool {
+        !matches!(self, Self::Direct | Self::Stfa)
     }
 
     /// Returns whether networks correct direct appearance.
@@ -61,12 +71,6 @@ pub struct AppearanceOptions {
 }
 
 impl AppearanceOptions {
-    /// Returns the defaults with another mode.
-    #[must_use]
-    pub fn of_mode(mode: AppearanceMode) -> Self {
-        Self { mode, ..Self::default() }
-    }
-
     /// Loads the networks that correct direct appearance; `None` for the direct modes.
     ///
     /// # Errors

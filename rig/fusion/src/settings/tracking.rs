@@ -62,17 +62,12 @@ pub struct TrackingSettings {
     /// Number of Gaussians that the default solver compares with the images; the others follow.
     #[arg(skip = Self::default().gaussians)]
     pub gaussians: usize,
-    /// Whether images are compared no finer than is informative.
-    #[arg(skip = Self::default().level_of_detail)]
-    pub level_of_detail: bool,
     /// Largest number of compared views; 0: all.
     #[arg(skip = Self::default().views)]
     pub views: usize,
-    /// Relative growth of the loss up to which a frame set gets no iteration, once the solver has converged.
-    #[arg(skip = Self::default().rest)]
-    pub rest: f64,
-    /// Whether every image is explained with the pose of its own capture time.
+    /// Whether every image is explained with the pose of its own capture time, for measurements.
     #[arg(skip = Self::default().per_view_time)]
+    #[serde(skip)]
     pub per_view_time: bool,
     /// Options of the deformation in place of those that the settings above imply, for measurements.
     #[arg(skip)]
@@ -82,15 +77,7 @@ pub struct TrackingSettings {
 
 impl Default for TrackingSettings {
     fn default() -> Self {
-        Self {
-            solver: Solver::GaussNewton,
-            gaussians: 30_000,
-            level_of_detail: true,
-            views: 0,
-            rest: 0.01,
-            per_view_time: true,
-            replaced: None,
-        }
+        Self { solver: Solver::GaussNewton, gaussians: 30_000, views: 0, per_view_time: true, replaced: None }
     }
 }
 
@@ -105,10 +92,6 @@ impl TrackingSettings {
         if self.solver == Solver::GaussNewton {
             options.gaussians = self.gaussians;
             options.views = self.views;
-            if !self.level_of_detail {
-                options = options.without_level_of_detail();
-            }
-            options.solver.rest = self.rest;
         }
         Some(options)
     }
@@ -119,8 +102,7 @@ impl TrackingSettings {
     /// [`FusionError::Setting`] names the key and the range.
     pub fn validate(&self) -> Result<(), FusionError> {
         check("tracking.gaussians", self.gaussians as f64, 100.0, 2_000_000.0)?;
-        check("tracking.views", self.views as f64, 0.0, 1000.0)?;
-        check("tracking.rest", self.rest, 0.0, 0.5)
+        check("tracking.views", self.views as f64, 0.0, 1000.0)
     }
 }
 

@@ -68,7 +68,7 @@ const CONFIG_WORDS: &[&str] = &[
     "= [",
     "{ ",
     "'''",
-    "[sim.faults]\n",
+    "[faults]\n",
     "0x",
     "1979-05-27T07:32:00Z",
 ];
@@ -206,7 +206,8 @@ fn calibration(input: &[u8]) -> Result<String, String> {
 
 fn config(input: &[u8]) -> Result<String, String> {
     let text = String::from_utf8_lossy(input);
-    told(flyrig::check_config(&text), "a configuration")
+    let rig = told(flyrig::check_config(&text), "a configuration");
+    rig.or_else(|error| flyrig::check_simulator(&text).map(|()| "a simulated rig".to_owned()).map_err(|_| error))
 }
 
 /// The first byte chooses the message.

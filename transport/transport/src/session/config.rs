@@ -43,7 +43,8 @@ pub struct TransportConfig {
     pub shared_memory: bool,
     /// Publisher: largest number of subscribers with a viewpoint of their own.
     pub max_viewers: usize,
-    /// Publisher: lifetime of a viewpoint that is not renewed, milliseconds.
+    /// Publisher: lifetime of a viewpoint that is not renewed, milliseconds. Not part of a configuration.
+    #[serde(skip)]
     pub viewpoint_lease_millis: u64,
     /// Publisher: pixels per second of all viewpoints together, width * height * frame rate each; requests beyond it are refused. The
     /// default is four viewers with 512x512 pixels at 30 per second.
