@@ -8,10 +8,8 @@ use std::{
 use clap::{Args, Parser, Subcommand, builder::TypedValueParser as _};
 use flyrig_body::DEFAULT_GAUSSIAN_COUNT;
 use flyrig_fusion::{BodySettings, BudgetSettings, NetworksOn, Origin, PerceptionSettings, SessionSettings};
-use flyrig_report::{
-    ReplaySettings,
-    arguments::{parse_fps, parse_minutes, parse_range, parse_seconds, parse_size},
-};
+use flyrig_report::arguments::{parse_fps, parse_minutes, parse_range, parse_seconds, parse_size};
+use flyrig_takes::ReplaySettings;
 
 use crate::stream::Subject;
 
@@ -130,7 +128,6 @@ impl ReplayArgs {
         let body = BodySettings { gaussians, ..BodySettings::default() };
         ReplaySettings {
             dataset: dataset.to_owned(),
-            recorded: None,
             inputs: self.inputs.clone(),
             holdout: self.holdout.clone(),
             session: SessionSettings { perception, body, budget, ..SessionSettings::default() },

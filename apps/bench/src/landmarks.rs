@@ -6,7 +6,8 @@ use anyhow::{Context, Result};
 use flyrig_body::load_gltf;
 use flyrig_capture::{FolderOptions, FolderReplay};
 use flyrig_fusion::next_frame;
-use flyrig_report::{dataset, progress_bar};
+use flyrig_report::progress_bar;
+use flyrig_takes::dataset;
 use flyrig_tracker::{Doubt, LANDMARK_NAMES, LandmarkStudy, PoseNet};
 
 use crate::cli::BenchLandmarksArgs;

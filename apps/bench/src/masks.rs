@@ -4,8 +4,9 @@ use anyhow::{Context as _, Result};
 use flyrig_body::{ShapeParams, default_template};
 use flyrig_capture::{FolderOptions, FolderReplay};
 use flyrig_fusion::SetReader;
-use flyrig_report::{dataset, frame_number, png, progress_bar, write_whole};
+use flyrig_report::{png, progress_bar, write_whole};
 use flyrig_sync::SyncSettings;
+use flyrig_takes::{dataset, frame_number};
 use flyrig_tracker::{PoseConfig, PoseNet, Viewers};
 use flyrig_types::Rig;
 
@@ -17,7 +18,7 @@ pub fn masks(args: &BenchMasksArgs) -> Result<()> {
     let template = default_template(&ShapeParams::default())?;
     for camera in &rig.cameras {
         let alone = Rig { cameras: vec![camera.clone()], world_up: rig.world_up };
-        let plates = dataset::plates(&args.dataset.join("background"), &alone)?;
+        let plates = dataset::load_plates(&args.dataset.join("background"), &alone)?;
         let mut viewers = Viewers::new(&PoseNet::embedded()?, &template, &alone, plates, &PoseConfig::default())?;
         let options = FolderOptions { fps: args.fps, ..FolderOptions::default() };
         let sources = FolderReplay::open(&args.dataset, Some(std::slice::from_ref(&camera.id)), &options)?;

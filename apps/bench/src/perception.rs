@@ -10,7 +10,8 @@ use flyrig_body::{ShapeParams, Skeleton, Template, default_template, load_gltf};
 use flyrig_fusion::{BodySettings, Origin, Outcome, PerceptionSettings, PersonId, SessionSettings};
 use flyrig_gpu::GpuContext;
 use flyrig_metrics::{CameraScore, ScoreSheet, score_view};
-use flyrig_report::{Replay, ReplaySettings, dataset, progress_bar, write_whole};
+use flyrig_report::{progress_bar, write_whole};
+use flyrig_takes::{Replay, ReplaySettings, dataset};
 use flyrig_types::{Frame, FrameSet, Mask, Pose};
 use glam::{DQuat, DVec3};
 use serde::Serialize;
@@ -125,7 +126,6 @@ fn run(args: &BenchPerceptionArgs, folder: &Path, inputs: Inputs, gpu: &GpuConte
     let body = BodySettings::with_gaussians(args.gaussians);
     let settings = ReplaySettings {
         dataset: folder.to_owned(),
-        recorded: None,
         inputs: args.inputs.clone(),
         holdout: if args.no_views { Vec::new() } else { args.holdout.clone() },
         session: SessionSettings { perception, body, ..SessionSettings::default() },

@@ -16,9 +16,8 @@ use flyrig_avatar::Avatar;
 use flyrig_body::Template;
 use flyrig_fusion::{AppearanceOptions, BodySettings, BudgetSettings, SessionSettings};
 use flyrig_gpu::GpuContext;
-use flyrig_report::{Replay, ReplaySettings};
+use flyrig_takes::{Replay, ReplaySettings};
 
-use crate::recording;
 use arguments::{AvatarAction, TakeArgs};
 
 /// Runs the command.
@@ -72,7 +71,6 @@ fn open_replay(
 ) -> Result<Replay> {
     let settings = ReplaySettings {
         dataset: take.dataset.clone(),
-        recorded: recording::rig_of_take(&take.dataset)?,
         inputs: take.inputs.clone(),
         holdout: holdout.to_vec(),
         session: SessionSettings {

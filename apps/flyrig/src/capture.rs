@@ -15,13 +15,11 @@ use flyrig_fusion::{Health, check_threads};
 use flyrig_gpu::GpuContext;
 use flyrig_monitor::{Arrivals, Monitor, ended_by_itself};
 use flyrig_report::stop;
+use flyrig_takes::{Needs, SourceKind, host_clock};
 use flyrig_transport::{CameraPublisher, CameraStatus, TransportConfig};
 use flyrig_types::{CameraId, Frame};
 
-use crate::{
-    config::{Config, SourceKind},
-    live, network, source,
-};
+use crate::{config::Config, opening::open_cameras};
 
 /// How often the state of cameras is published.
 const STATUS_EVERY: Duration = Duration::from_secs(1);
@@ -37,11 +35,12 @@ pub fn capture(config: &Config, key: Option<&Path>, gpu: Option<&GpuContext>) ->
     let kind = config.source.kind;
     ensure!(kind != SourceKind::Network, "source.kind is \"network\": these cameras are on the network already");
     let mut monitor = Monitor::start(&config.health.listen, false)?;
-    let sources =
-        if kind == SourceKind::Cameras { live::openers(&config.source)? } else { source::open(config, gpu)?.cameras };
+    // Cameras of this computer need no calibration here.
+    let needs = if kind == SourceKind::Cameras { Needs::Frames } else { Needs::Calibration };
+    let sources = open_cameras(config, needs, gpu)?.sources;
     let cameras: Vec<CameraId> = sources.iter().map(|source| source.camera().clone()).collect();
     let threads = start(config, sources)?;
-    let clock = network::host_clock();
+    let clock = host_clock();
     let transport = key.map_or_else(|| config.transport(), TransportConfig::with_key);
     let publisher = CameraPublisher::open(&transport, &cameras, clock.clone())?;
     let place = match transport.connect.as_slice() {

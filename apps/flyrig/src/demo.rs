@@ -17,15 +17,16 @@ use flyrig_fusion::{
 };
 use flyrig_gpu::GpuContext;
 use flyrig_metrics::{CameraScore, ScoreSheet, score_view};
-use flyrig_report::{ContactRow, Curve, Report, contact_images, dataset, png, progress_bar, stop, write_whole};
+use flyrig_report::{ContactRow, Curve, Report, contact_images, png, progress_bar, stop, write_whole};
 use flyrig_sim::{FaultScript, MotionConfig, MotionKind, SimConfig, SimFrame, SimTime, Simulator};
 use flyrig_sync::SyncSettings;
+use flyrig_takes::{dataset::select_cameras, simulated_plates};
 use flyrig_transport::{Publisher, TransportConfig};
 use flyrig_types::{Camera, Frame, FrameSet, Rig};
 use indicatif::ProgressBar;
 use serde::{Deserialize as _, Serialize, de::IntoDeserializer as _};
 
-use crate::{cli::DemoArgs, source::simulated_plates, watch::WatchStats};
+use crate::{cli::DemoArgs, watch::WatchStats};
 
 /// Cameras that go in, and cameras that are only rendered and compared.
 const INPUTS: [&str; 3] = ["00", "03", "05"];
@@ -186,8 +187,8 @@ fn pass(
     publisher: Option<LivePublisher>,
 ) -> Result<Pass> {
     let rig = lock(simulator)?.rig().clone();
-    let inputs = dataset::pick(&rig, &INPUTS.map(str::to_owned), "the simulated rig")?;
-    let held_out = dataset::pick(&rig, &HELD_OUT.map(str::to_owned), "the simulated rig")?.cameras;
+    let inputs = select_cameras(&rig, &INPUTS.map(str::to_owned), "the simulated rig")?;
+    let held_out = select_cameras(&rig, &HELD_OUT.map(str::to_owned), "the simulated rig")?.cameras;
     let sources: Vec<Box<dyn CameraSource>> = flyrig_sim::sources(simulator, SimTime::Exact)
         .into_iter()
         .filter(|source| inputs.slot(source.camera()).is_some())

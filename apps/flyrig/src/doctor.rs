@@ -5,8 +5,9 @@ use std::{fmt::Write as _, path::Path};
 use anyhow::Result;
 use flyrig_capture::NokhwaDevice;
 use flyrig_gpu::adapter_names;
+use flyrig_takes::SourceKind;
 
-use crate::config::{Config, SourceKind};
+use crate::config::Config;
 
 const NO_CAMERA: &str = "no camera: plug one in, or simulate a rig with source.kind = \"sim\"";
 

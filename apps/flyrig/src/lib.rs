@@ -4,7 +4,6 @@
 
 mod avatar;
 mod calibrate;
-mod cameras;
 mod capture;
 mod cli;
 mod config;
@@ -12,19 +11,18 @@ mod demo;
 mod doctor;
 mod eval;
 mod keys;
-mod live;
-mod network;
+mod opening;
 mod plate;
 mod pose_recording;
 mod recording;
+mod replay;
 mod run;
 mod serve;
-mod silhouettes;
 mod sim_export;
-mod source;
+#[cfg(test)]
+mod source_tests;
 mod stream_recording;
 mod sync_check;
-mod take;
 mod view;
 mod watch;
 
@@ -36,10 +34,11 @@ use flyrig_report::{
     program::{self, open_gpu},
     traced,
 };
+use flyrig_takes::SourceKind;
 
 use crate::{
     cli::{Cli, Command, ConfigAction, SimAction},
-    config::{Config, DEFAULT_TOML, SourceKind},
+    config::{Config, DEFAULT_TOML},
 };
 
 /// Reads and checks a configuration; the error is what `flyrig config check` says.
@@ -81,7 +80,7 @@ fn dispatch(cli: &Cli) -> Result<()> {
             let gpu = (config.source.kind == SourceKind::Sim).then(|| open_gpu(adapter)).transpose()?;
             capture::capture(&config, key.as_deref(), gpu.as_ref())
         }
-        Command::Replay(args) => recording::replay(args),
+        Command::Replay(args) => replay::replay(args),
         Command::SyncCheck(args) => sync_check::sync_check(args, &|| open_gpu(cli.adapter.as_deref())),
         Command::Plate(args) => plate::plate(args, &|| open_gpu(cli.adapter.as_deref())),
         Command::Calibrate { action } => calibrate::calibrate(action, &|| open_gpu(cli.adapter.as_deref())),

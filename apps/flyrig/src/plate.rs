@@ -8,14 +8,12 @@ use std::{
 use anyhow::{Context as _, Result, bail, ensure};
 use flyrig_capture::{CaptureThreads, Pacing, PopError, SourceOpener, ThreadsConfig, to_rgb8};
 use flyrig_gpu::GpuContext;
-use flyrig_report::{dataset, png, progress_bar, stop, write_whole};
+use flyrig_report::{png, progress_bar, stop, write_whole};
+use flyrig_takes::{Needs, TakeOptions, dataset};
 use flyrig_tracker::{PoseNet, shows_person};
 use flyrig_types::{CameraId, Frame, Image, PixelFormat};
 
-use crate::{
-    cli::PlateArgs,
-    take::{self, Take},
-};
+use crate::{cli::PlateArgs, opening::open_take};
 
 /// Frames of a camera that the median is taken over, spread over the time.
 const FRAMES: usize = 25;
@@ -30,7 +28,9 @@ const MOVED_PIXELS: f64 = 0.01;
 /// Runs the command. `gpu` opens a graphics adapter, for simulated cameras alone.
 pub fn plate(args: &PlateArgs, gpu: &dyn Fn() -> Result<GpuContext>) -> Result<()> {
     stop::flag();
-    let Take { sources, pacing } = take::open(std::slice::from_ref(&args.input), args.fps, gpu)?;
+    let options = TakeOptions { fps: args.fps, needs: Needs::Frames, ..TakeOptions::default() };
+    let take = open_take(std::slice::from_ref(&args.input), &options, gpu)?;
+    let (pacing, sources) = (take.pacing(), take.sources);
     let cameras: Vec<CameraId> = sources.iter().map(|source| source.camera().clone()).collect();
     let folder = args.out.join("background");
     let files: Vec<PathBuf> = cameras.iter().map(|camera| dataset::plate_file(&folder, camera)).collect();

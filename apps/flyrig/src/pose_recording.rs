@@ -9,14 +9,13 @@ use std::path::Path;
 use anyhow::{Context as _, Result, ensure};
 use flyrig_body::Skeleton;
 use flyrig_capture::{MessageTap, Recorder, recorded_messages};
+use flyrig_takes::recorded::schema;
 use flyrig_types::Pose;
 use foxglove::{
     Decode as _, Encode as _,
     messages::{FrameTransform, FrameTransforms, Quaternion, Timestamp, Vector3},
 };
 use glam::{DQuat, DVec3};
-
-use crate::recording;
 
 /// Where poses are in a recording.
 const TOPIC: &str = "pose";
@@ -33,7 +32,7 @@ pub struct PoseRecording(MessageTap);
 impl PoseRecording {
     /// A channel of its own in the file.
     pub fn new(recorder: &Recorder) -> Self {
-        Self(recorder.messages(TOPIC, recording::schema::<FrameTransforms>()))
+        Self(recorder.messages(TOPIC, schema::<FrameTransforms>()))
     }
 
     /// Records a pose of an instant, nanoseconds on the clock of the frames.

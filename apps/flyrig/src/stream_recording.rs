@@ -14,6 +14,7 @@ use anyhow::{Context as _, Result, ensure};
 use flyrig_capture::{MessageTap, Pacing, monotonic_nanos, recorded_messages};
 use flyrig_report::stop;
 use flyrig_stream::{Stamp, restamp, stamp_of, template_hash};
+use flyrig_takes::recorded::recorded_cameras;
 use flyrig_transport::{Interests, PersonMessage, Publisher, Subscriber, TransportConfig};
 
 use crate::{
@@ -134,8 +135,7 @@ pub fn record(args: &WatchArgs, path: &Path) -> Result<()> {
 /// Runs `flyrig play`.
 pub fn play(args: &PlayArgs) -> Result<()> {
     let stop = stop::flag();
-    let (_, rig) = recording::recorded_cameras(&args.recording)?;
-    let rig = rig.with_context(|| {
+    let rig = recorded_cameras(&args.recording)?.rig.with_context(|| {
         format!("{} has no calibration; record it with flyrig watch --record", args.recording.display())
     })?;
     let first = recorded_messages(&args.recording, TOPIC)?.next();

@@ -9,13 +9,10 @@ use flyrig_report::stop;
 use flyrig_sync::{
     ClockKind, LagEstimate, MotionSignal, SilhouetteTrack, SyncSettings, estimate_lags, estimate_silhouette_lags,
 };
+use flyrig_takes::{Calibration, SilhouetteFinder, Take, TakeOptions, TakeSpan};
 use flyrig_types::{CameraId, Image, Rig};
 
-use crate::{
-    cli::SyncCheckArgs,
-    silhouettes::Silhouettes,
-    take::{self, CalibratedTake},
-};
+use crate::{cli::SyncCheckArgs, opening::open_take};
 
 const ADD_TO_CAMERA: &str = "add it to the lag_ms that its [[source.cameras]] has (0 without one)";
 const ADD: &str = "add it to the camera's time_offset_ms in calibration.toml, or to [sync] lags_ms or --lag CAM=MS, which replace that";
@@ -23,12 +20,13 @@ const ADD: &str = "add it to the camera's time_offset_ms in calibration.toml, or
 /// Runs the command. `gpu` opens a graphics adapter, for simulated cameras alone.
 pub fn sync_check(args: &SyncCheckArgs, gpu: &dyn Fn() -> Result<GpuContext>) -> Result<()> {
     stop::flag();
-    let mut take = take::open_calibrated(&args.input, args.fps, args.calibration.as_deref(), gpu)?;
+    let calibration = args.calibration.as_deref();
+    let mut take = open_take(&args.input, &TakeOptions { fps: args.fps, calibration, ..TakeOptions::default() }, gpu)?;
     let cameras: Vec<CameraId> = take.sources.iter().map(|source| source.camera().clone()).collect();
     ensure!(cameras.len() > 1, "a time offset needs at least two cameras; name another one");
     let advice = if take.is_live { ADD_TO_CAMERA } else { ADD };
     let (estimates, frames, told, mend) = match take.calibration.take() {
-        Some((rig, plates)) if !take.is_live => {
+        Some(Calibration { rig, plates }) if !take.is_live => {
             let (estimates, frames) = by_silhouettes(args, &rig, plates, take)?;
             let told = "by silhouettes; +- is the standard error, fit how much better the lag fits than others";
             let mend = "the estimate is less certain than 5 ms: let one person whom all cameras see whole jump, squat and wave \
@@ -131,28 +129,21 @@ fn by_silhouettes(
     args: &SyncCheckArgs,
     rig: &Rig,
     plates: Vec<Option<Image>>,
-    take: CalibratedTake,
+    take: Take,
 ) -> Result<(Vec<LagEstimate>, Vec<usize>)> {
-    let mut silhouettes = Silhouettes::new(rig, plates, take.given_masks)?;
+    let mut silhouettes = SilhouetteFinder::new(rig, plates, take.given_masks)?;
     let mut pictures = vec![0usize; rig.cameras.len()];
     // One camera may be ahead by as much as another is behind.
     let spread_nanos = (args.most_ms * 2e6) as u64;
-    let errors = take::each_set(
-        take.sources,
-        rig,
-        take.sync,
-        spread_nanos,
-        [args.from_secs, args.from_secs + args.seconds],
-        "silhouettes, ms of the take",
-        |set| {
-            set.present().for_each(|(slot, _)| pictures[slot] += 1);
-            silhouettes.add(set)
-        },
-    )?;
+    let span = TakeSpan { secs: [args.from_secs, args.from_secs + args.seconds], spread_nanos };
+    let errors = take.for_each_set(rig, span, "silhouettes, ms of the take", |set| {
+        set.present().for_each(|(slot, _)| pictures[slot] += 1);
+        silhouettes.add(set)
+    })?;
     let tracks = silhouettes.into_tracks();
     let frames: Vec<usize> = tracks.iter().map(SilhouetteTrack::len).collect();
     if let Some((slot, error)) =
-        (0..pictures.len()).filter(|&slot| pictures[slot] == 0).find_map(|slot| Some((slot, errors.of(slot)?)))
+        (0..pictures.len()).filter(|&slot| pictures[slot] == 0).find_map(|slot| Some((slot, errors.get(slot)?)))
     {
         bail!("no image of camera {} could be used; the last: {error}", rig.cameras[slot].id);
     }
@@ -163,14 +154,13 @@ fn by_silhouettes(
 mod tests {
     use flyrig_capture::CameraSource as _;
     use flyrig_gpu::AdapterChoice;
-    use flyrig_report::dataset;
     use flyrig_sim::{Fault, FaultKind, FaultScript, MotionConfig, MotionKind, SimConfig, SimTime, Simulator};
+    use flyrig_takes::dataset::select_cameras;
     use rand::{RngExt as _, SeedableRng as _, rngs::SmallRng};
 
     use std::sync::{Arc, Mutex};
 
     use super::*;
-    use crate::source;
 
     const NAMES: [&str; 4] = ["00", "02", "03", "05"];
 
@@ -201,11 +191,13 @@ mod tests {
                 ..SimConfig::default()
             };
             let simulator = Simulator::new(gpu, &config).unwrap();
-            let rig = dataset::pick(&simulator.reported_rig(), &NAMES.map(str::to_owned), "the simulated rig").unwrap();
+            let rig =
+                select_cameras(&simulator.reported_rig(), &NAMES.map(str::to_owned), "the simulated rig").unwrap();
             let simulator = Arc::new(Mutex::new(simulator));
             let sources = flyrig_sim::sources(&simulator, SimTime::Exact);
-            let chosen = sources.into_iter().filter(|source| NAMES.contains(&source.camera().as_str())).collect();
-            Self { lags_ms: lags_ms.map(|lag| lag - lags_ms[0]), rig, sources: source::ready(chosen) }
+            let chosen = sources.into_iter().filter(|source| NAMES.contains(&source.camera().as_str()));
+            let sources = chosen.map(|source| SourceOpener::ready(Box::new(source))).collect();
+            Self { lags_ms: lags_ms.map(|lag| lag - lags_ms[0]), rig, sources }
         }
 
         /// By what was found, off by how many milliseconds, if anything was found; the standard error or disagreement.
@@ -227,13 +219,7 @@ mod tests {
 
         /// With silhouettes that are found in the images, without plates.
         fn by_silhouettes(mut self) -> Vec<(Option<f64>, f64)> {
-            let take = CalibratedTake {
-                sources: std::mem::take(&mut self.sources),
-                is_live: false,
-                calibration: None,
-                given_masks: false,
-                sync: SyncSettings::default(),
-            };
+            let take = Take::from_sources(std::mem::take(&mut self.sources));
             let (estimates, frames) = by_silhouettes(&args(), &self.rig, NAMES.map(|_| None).into(), take).unwrap();
             println!("{frames:?} silhouettes");
             self.off(&estimates)

@@ -1,15 +1,14 @@
-//! Real cameras: from the configuration to sources.
+//! Cameras of this computer, from their configuration to sources.
 
 use anyhow::Result;
 use flyrig_calib::load_calibration;
 use flyrig_capture::SourceOpener;
 use flyrig_types::{CameraId, Rig};
 
-use crate::{cameras::CameraEntry, config::SourceSection};
+use crate::source_section::{CameraEntry, SourceSection};
 
-/// Reads the calibration; where its files do not say how large the images are, the configuration does, and where both do,
-/// they must agree.
-pub fn load_rig(source: &SourceSection) -> Result<Rig> {
+/// Loads the calibration of live cameras. Image sizes that its files lack come from the configuration; sizes in both must agree.
+pub(crate) fn load_rig(source: &SourceSection) -> Result<Rig> {
     let size = |id: &CameraId| {
         let entry = source.cameras.iter().find(|entry| entry.name() == id.as_str())?;
         entry.device().ok().map(|section| (section.size[0], section.size[1]))
@@ -17,18 +16,18 @@ pub fn load_rig(source: &SourceSection) -> Result<Rig> {
     Ok(load_calibration(source.calibration_folder().unwrap_or(&source.path), &size)?)
 }
 
-/// Returns an opener for every camera of the configuration; the images come in the cameras' own formats.
+/// Returns an opener for every camera of the configuration; images keep the cameras' own formats.
 ///
 /// # Errors
-/// Settings that no camera could be opened with. A camera that is missing is no error: it joins when it comes.
-pub fn openers(source: &SourceSection) -> Result<Vec<SourceOpener>> {
+/// Settings with which no camera can be opened. A missing camera is no error: it joins once it is plugged in.
+pub(crate) fn openers(source: &SourceSection) -> Result<Vec<SourceOpener>> {
     let opener = |entry: &CameraEntry| -> Result<SourceOpener> {
         let id = CameraId::from(entry.name());
         let options = entry.device()?.options()?;
-        let of_thread = id.clone();
+        let thread_id = id.clone();
         Ok(SourceOpener::new(&id, move || {
-            let camera = options.open(&of_thread)?;
-            tracing::info!("camera {of_thread}: {}", camera.health().mode);
+            let camera = options.open(&thread_id)?;
+            tracing::info!("camera {thread_id}: {}", camera.health().mode);
             Ok(camera)
         }))
     };

@@ -1,40 +1,92 @@
-//! Sets of images of a take: a folder's, or those of a recording, which are decoded here.
+//! Frame sets of stored footage; images of recordings are decoded here.
 
-use std::{ops::Range, sync::Arc};
+use std::{collections::BTreeMap, ops::Range, sync::Arc};
 
 use anyhow::Result;
-use flyrig_capture::{CaptureError, CaptureErrorKind, Decoding, FrameStage as _};
+use flyrig_capture::{CaptureError, CaptureErrorKind, Decoding, FolderOptions, FrameStage as _};
 use flyrig_fusion::SetReader;
-use flyrig_types::{Camera, Frame, FrameSet};
+use flyrig_sync::SyncSettings;
+use flyrig_types::{Camera, CameraId, Frame, FrameSet, Rig};
 
-/// Sets of a take in their order.
-pub(crate) struct TakeSets {
+use crate::footage::{Footage, OpenFootage};
+
+/// Footage with the frames that are read and the time offsets that are applied.
+pub(crate) struct FrameSelection {
+    pub footage: Footage,
+    /// Frames per second.
+    pub fps: f64,
+    /// Range of frames; all for `None`.
+    pub frames: Option<Range<u64>>,
+    /// Time offsets that are subtracted from the timestamps, nanoseconds.
+    pub lags_nanos: BTreeMap<CameraId, i64>,
+}
+
+impl FrameSelection {
+    /// Opens these cameras.
+    pub fn open(&self, cameras: &[Camera], with_masks: bool) -> Result<OpenFootage> {
+        let ids: Vec<CameraId> = cameras.iter().map(|camera| camera.id.clone()).collect();
+        self.footage.open(Some(&ids), &FolderOptions { fps: self.fps, frames: self.frames.clone(), with_masks })
+    }
+
+    /// Opens the frame sets of a rig; returns the number of a folder's frames with them.
+    pub fn open_sets(&self, rig: &Rig, with_masks: bool) -> Result<(FrameSets, usize)> {
+        let OpenFootage { sources, frames } = self.open(&rig.cameras, with_masks)?;
+        let sync = SyncSettings {
+            // Timestamps of a folder follow from the frame numbers; those of a recording are the cameras'.
+            window_nanos: (!self.is_encoded()).then(|| self.half_period_nanos()),
+            lags_nanos: self.lags_nanos.clone(),
+            ..SyncSettings::default()
+        };
+        let reader = SetReader::new(sources, &sync);
+        let range = self.frames.clone().unwrap_or(0..u64::MAX);
+        let sets = if self.is_encoded() {
+            FrameSets::recording(reader, &rig.cameras, range)
+        } else {
+            FrameSets::folder(reader)
+        };
+        Ok((sets, frames))
+    }
+
+    /// Returns whether frames arrive as the cameras sent them, to be decoded here.
+    pub fn is_encoded(&self) -> bool {
+        matches!(self.footage, Footage::Recording(_))
+    }
+
+    /// Returns half of a frame period, within which a frame belongs to one frame set alone, nanoseconds.
+    pub fn half_period_nanos(&self) -> u64 {
+        (0.5e9 / self.fps).ceil() as u64
+    }
+}
+
+/// Frame sets of stored footage in the order of time.
+pub(crate) struct FrameSets {
     reader: SetReader,
     recorded: Option<Recorded>,
 }
 
-/// How the sets of a recording are taken.
+/// Selection and decoding of a recording's frame sets.
 struct Recorded {
-    /// Numbers of the sets, counted from the first of the recording.
+    /// Numbers of the frame sets, counted from the first of the recording.
     range: Range<u64>,
-    /// One for each slot.
+    /// Decoders, one per slot.
     decoding: Vec<Decoding>,
     damaged: u64,
 }
 
-impl TakeSets {
-    /// Of a folder.
+impl FrameSets {
+    /// Reads the frame sets of a folder.
     pub fn folder(reader: SetReader) -> Self {
         Self { reader, recorded: None }
     }
 
-    /// Of a recording: sets of these numbers, of the calibrated cameras in the order of the slots.
+    /// Reads the frame sets of a recording with numbers in `range`; `cameras` are in the order of the slots.
     pub fn recording(reader: SetReader, cameras: &[Camera], range: Range<u64>) -> Self {
         let decoding = cameras.iter().map(|camera| Decoding::new(Some(camera.size()))).collect();
         Self { reader, recorded: Some(Recorded { range, decoding, damaged: 0 }) }
     }
 
-    /// Returns the next set; `None` at the end. Images that cannot be decoded are missing. Frames of a recording get the number of their set.
+    /// Returns the next frame set; `None` at the end. Images that cannot be decoded are missing. Frames of a recording get the number of their
+    /// frame set.
     pub fn next_set(&mut self) -> Result<Option<FrameSet>> {
         let Some(Recorded { range, decoding, damaged }) = &mut self.recorded else {
             return Ok(self.reader.next_set()?);
@@ -44,9 +96,9 @@ impl TakeSets {
                 continue;
             }
             for (slot, decoding) in set.frames.iter_mut().zip(decoding) {
-                // Nobody else holds it yet.
+                // The reader has given its only reference away.
                 let Some(frame) = slot.take().and_then(Arc::into_inner) else { continue };
-                match decoded(decoding, Frame { sequence: set.index, ..frame })? {
+                match decode_or_skip(decoding, Frame { sequence: set.index, ..frame })? {
                     Some(frame) => *slot = Some(Arc::new(frame)),
                     None => *damaged += 1,
                 }
@@ -56,7 +108,7 @@ impl TakeSets {
         Ok(None)
     }
 
-    /// Counts of complete and partial sets and of broken images.
+    /// Returns the counts of complete and partial frame sets and of broken images.
     pub fn summary(&self) -> serde_json::Value {
         let counts = self.reader.counts();
         let damaged = self.reader.damaged() + self.recorded.as_ref().map_or(0, |recorded| recorded.damaged);
@@ -64,8 +116,8 @@ impl TakeSets {
     }
 }
 
-/// Decodes a frame; None, with a warning, for one that is damaged.
-pub(crate) fn decoded(decoding: &mut Decoding, frame: Frame) -> Result<Option<Frame>, CaptureError> {
+/// Decodes a frame; warns of a damaged one and returns `None`.
+pub(crate) fn decode_or_skip(decoding: &mut Decoding, frame: Frame) -> Result<Option<Frame>, CaptureError> {
     let camera = frame.camera.clone();
     match decoding.process(frame).map_err(|error| error.of(&camera)) {
         Ok(frame) => Ok(Some(frame)),

@@ -1,4 +1,4 @@
-//! A take: a configuration, a recording, a folder of images, or videos, opened with or without its calibration.
+//! Takes, opened with or without their calibration.
 
 use std::{
     path::{Path, PathBuf},
@@ -6,208 +6,290 @@ use std::{
 };
 
 use anyhow::{Result, bail, ensure};
-use flyrig_capture::{FolderOptions, FolderReplay, Pacing, SourceOpener, VideoOptions, VideoReplay};
-use flyrig_fusion::{InputFormat, Intake, Origin};
+use flyrig_body::Template;
+use flyrig_capture::{CameraSource, FolderOptions, Pacing, SourceOpener};
+use flyrig_fusion::{InputFormat, Intake};
 use flyrig_gpu::GpuContext;
-use flyrig_report::{dataset, progress_bar, stop};
+use flyrig_report::{progress_bar, stop};
 use flyrig_sync::SyncSettings;
-use flyrig_types::{CameraId, FrameSet, Image, Rig};
+use flyrig_types::{CameraId, FrameSet, Image, PoseTrack, Rig, ThreadWatch};
 
 use crate::{
-    config::{Config, SourceKind},
-    live, recording, source,
+    configured::TakeConfig,
+    dataset,
+    footage::{Footage, has_ending},
+    recorded::recorded_cameras,
 };
 
-/// Cameras of a take.
+/// Longest wait for a camera's frame in stored footage without synchronization settings, nanoseconds.
+const MAX_WAIT_NANOS: u64 = 1_000_000_000;
+/// Largest jitter of timestamps at the beginning of a span, seconds.
+const JITTER_SECS: f64 = 1e-3;
+
+/// Source of a take.
+#[derive(Debug, Clone)]
+pub enum TakeInput {
+    /// Stored images.
+    Footage(Footage),
+    /// Cameras of a configuration.
+    Configuration(Box<TakeConfig>),
+}
+
+impl TakeInput {
+    /// Finds what a command line names: a configuration, one folder, one recording, or videos. `read` reads a configuration file.
+    ///
+    /// # Errors
+    /// The only path does not exist; errors of `read`.
+    pub fn from_paths(paths: &[PathBuf], read: impl FnOnce(&Path) -> Result<TakeConfig>) -> Result<Self> {
+        match paths {
+            [path] if has_ending(path, "toml") => Ok(Self::Configuration(Box::new(read(path)?))),
+            _ => Footage::from_paths(paths).map(Self::Footage),
+        }
+    }
+}
+
+/// Parts of a take that its user needs.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
+pub enum Needs {
+    /// Frames alone: real cameras need no calibration, and plates are not read.
+    Frames,
+    /// Frames, and calibration and plates if there are any.
+    #[default]
+    Calibration,
+}
+
+/// Options of [`Take::open`].
+#[derive(Debug, Clone, Copy)]
+pub struct TakeOptions<'a> {
+    /// Frame rate of a folder of images, frames per second; a configuration has its own.
+    pub fps: f64,
+    /// Folder of a calibration that replaces the take's own.
+    pub calibration: Option<&'a Path>,
+    /// Parts that are needed.
+    pub needs: Needs,
+}
+
+impl Default for TakeOptions<'_> {
+    fn default() -> Self {
+        Self { fps: FolderOptions::default().fps, calibration: None, needs: Needs::default() }
+    }
+}
+
+/// Calibrated cameras and their plates.
+#[derive(Debug)]
+pub struct Calibration {
+    /// Cameras in the order of the take's sources.
+    pub rig: Rig,
+    /// Images of the empty scene, one per slot.
+    pub plates: Vec<Option<Image>>,
+}
+
+impl Calibration {
+    /// Returns a calibration without any plate.
+    #[must_use]
+    pub fn without_plates(rig: Rig) -> Self {
+        let plates = rig.cameras.iter().map(|_| None).collect();
+        Self { rig, plates }
+    }
+
+    /// Loads calibration and plates of a folder for these cameras, whose images lie in the folder `images`.
+    fn load(folder: &Path, images: &Path, sources: &[SourceOpener]) -> Result<Self> {
+        let cameras: Vec<CameraId> = sources.iter().map(|source| source.camera().clone()).collect();
+        let names: Vec<String> = cameras.iter().map(CameraId::to_string).collect();
+        let rig = dataset::load_rig_of(folder, images, &cameras)?;
+        let rig = dataset::select_cameras(&rig, &names, "the calibration")?;
+        let plates = dataset::load_plates(&folder.join("background"), &rig)?;
+        Ok(Self { rig, plates })
+    }
+}
+
+/// Body of the person whom a configuration names.
+#[derive(Debug, Clone)]
+pub struct TakeBody {
+    /// Skinned body.
+    pub template: Template,
+    /// Poses over time; `None` if they are unknown.
+    pub track: Option<PoseTrack>,
+}
+
+/// Opened take.
+///
+/// ```no_run
+/// use flyrig_takes::{Footage, Take, TakeInput, TakeOptions, TakeSpan};
+///
+/// let input = TakeInput::Footage(Footage::from_dataset("take.mcap".as_ref()));
+/// // Simulated cameras alone need a graphics adapter.
+/// let mut take = Take::open(&input, &TakeOptions::default(), &|| anyhow::bail!("no adapter"))?;
+/// let calibration = take.calibration.take().expect("recorded with a calibration");
+/// take.for_each_set(&calibration.rig, TakeSpan { secs: [0.0, 5.0], spread_nanos: 0 }, "ms of the take", |set| {
+///     println!("{} images at {} ns", set.present().count(), set.master_nanos);
+///     Ok(())
+/// })?;
+/// # anyhow::Ok(())
+/// ```
 pub struct Take {
+    /// One source per camera, in the rig's order if there is a rig. Only live cameras may be missing at first.
     pub sources: Vec<SourceOpener>,
-    pub pacing: Pacing,
+    /// Whether frames arrive as they are captured, and cannot wait.
+    pub is_live: bool,
+    /// Calibration and plates; `None` for uncalibrated cameras.
+    pub calibration: Option<Calibration>,
+    /// Whether the frames carry masks to be used.
+    pub given_masks: bool,
+    /// How frames are joined to sets; includes the time offsets of the calibration, which are subtracted from the timestamps.
+    pub sync: SyncSettings,
+    /// Body of the person; only configurations have one.
+    pub body: Option<TakeBody>,
+    /// Threads that the sources need.
+    pub threads: Vec<ThreadWatch>,
 }
 
 impl Take {
-    fn replayed(sources: Vec<SourceOpener>) -> Self {
-        Self { sources, pacing: Pacing::Lossless }
+    /// Opens a take. `gpu` opens a graphics adapter, for simulated cameras alone.
+    ///
+    /// # Errors
+    /// Names a file, camera or setting that is missing or wrong.
+    pub fn open(input: &TakeInput, options: &TakeOptions<'_>, gpu: &dyn Fn() -> Result<GpuContext>) -> Result<Self> {
+        let mut take = match input {
+            TakeInput::Configuration(config) => config.open(options.needs, gpu)?,
+            TakeInput::Footage(footage) => Self::open_footage(footage, options)?,
+        };
+        if let Some(folder) = options.calibration {
+            ensure!(
+                !take.is_live,
+                "--calibration processes every frame, which takes longer than live cameras wait; record them first (flyrig \
+                 record) and give the recording"
+            );
+            let images = match input {
+                TakeInput::Footage(footage) => footage.folder(),
+                TakeInput::Configuration(_) => None,
+            };
+            take.calibration = Some(Calibration::load(folder, images.unwrap_or(folder), &take.sources)?);
+        }
+        if let Some(Calibration { rig, .. }) = &take.calibration {
+            take.sync = take.sync.with_offsets_of(&rig.cameras);
+        }
+        Ok(take)
     }
-}
 
-/// Opens a take without its calibration. `gpu` opens a graphics adapter, for simulated cameras alone; `fps` is the frame rate of a
-/// folder.
-pub fn open(input: &[PathBuf], fps: f64, gpu: &dyn Fn() -> Result<GpuContext>) -> Result<Take> {
-    match input {
-        [path] if has_ending(path, "toml") => {
-            let mut config = Config::load_for_capture(path)?;
-            if config.source.kind == SourceKind::Cameras {
-                // Cameras need no calibration to give images.
-                return Ok(Take { sources: live::openers(&config.source)?, pacing: Pacing::AsDelivered });
+    /// Returns an uncalibrated take of stored cameras.
+    #[must_use]
+    pub fn from_sources(sources: Vec<SourceOpener>) -> Self {
+        Self {
+            sources,
+            is_live: false,
+            calibration: None,
+            given_masks: false,
+            sync: SyncSettings::default(),
+            body: None,
+            threads: Vec::new(),
+        }
+    }
+
+    fn open_footage(footage: &Footage, options: &TakeOptions<'_>) -> Result<Self> {
+        let needs_calibration = options.needs == Needs::Calibration;
+        let folder_options = FolderOptions { fps: options.fps, ..FolderOptions::default() };
+        match footage {
+            Footage::Folder(root) if needs_calibration => Self::open_folder(root, footage, options, folder_options),
+            Footage::Recording(path) => {
+                let cameras = recorded_cameras(path)?;
+                let take = Self::from_sources(ready(footage.open(Some(&cameras.ids), &folder_options)?.sources));
+                Ok(Self { calibration: cameras.rig.map(Calibration::without_plates), ..take })
             }
-            let is_sim = config.source.kind == SourceKind::Sim;
-            config.source.real_time &= !is_sim;
-            let gpu = is_sim.then(gpu).transpose()?;
-            let pacing = if config.source.kind.is_live() { Pacing::AsDelivered } else { Pacing::Lossless };
-            Ok(Take { sources: source::open_without_plates(&config, gpu.as_ref())?.cameras, pacing })
+            Footage::Videos(files) if needs_calibration && files.len() < 2 => bail!(
+                "{} is no configuration, recording or folder; name several videos, or one of these",
+                files.first().map_or_else(String::new, |file| file.display().to_string())
+            ),
+            Footage::Folder(_) | Footage::Videos(_) => {
+                Ok(Self::from_sources(ready(footage.open(None, &folder_options)?.sources)))
+            }
         }
-        [path] if has_ending(path, "mcap") => {
-            let (cameras, _) = recording::recorded_cameras(path)?;
-            Ok(Take::replayed(source::ready(recording::replay_sources(path, &cameras)?)))
+    }
+
+    /// Opens a folder with its calibration and plates, and with its masks if every calibrated camera has some.
+    fn open_folder(
+        root: &Path,
+        footage: &Footage,
+        options: &TakeOptions<'_>,
+        folder_options: FolderOptions,
+    ) -> Result<Self> {
+        let is_calibrated = dataset::has_calibration(root);
+        let mut sources = footage.open(None, &folder_options)?.sources;
+        let masks = root.join("mask");
+        let given_masks = (is_calibrated || options.calibration.is_some())
+            && sources.iter().all(|source| masks.join(source.camera().as_str()).is_dir());
+        if given_masks {
+            sources = footage.open(None, &FolderOptions { with_masks: true, ..folder_options })?.sources;
         }
-        [folder] if folder.is_dir() => Ok(Take::replayed(folder_sources(folder, fps, false)?)),
-        [path] if !path.exists() => bail!("{} does not exist", path.display()),
-        videos => Ok(Take::replayed(video_sources(videos)?)),
+        let sources = ready(sources);
+        let calibration = (is_calibrated && options.calibration.is_none())
+            .then(|| Calibration::load(root, root, &sources))
+            .transpose()?;
+        Ok(Self { calibration, given_masks, ..Self::from_sources(sources) })
+    }
+
+    /// Returns the pace at which every frame is read: live cameras do not wait, all others lose no frame.
+    #[must_use]
+    pub fn pacing(&self) -> Pacing {
+        if self.is_live { Pacing::AsDelivered } else { Pacing::Lossless }
+    }
+
+    /// Calls `each` with every frame set of a span, until Ctrl-C, under a progress bar.
+    ///
+    /// # Errors
+    /// The cameras cannot be started; errors of `each`.
+    pub fn for_each_set(
+        self,
+        rig: &Rig,
+        span: TakeSpan,
+        label: &'static str,
+        mut each: impl FnMut(&FrameSet) -> Result<()>,
+    ) -> Result<ReadErrors> {
+        let [from_secs, to_secs] = span.secs;
+        let max_wait_nanos = self.sync.max_wait_nanos.unwrap_or(MAX_WAIT_NANOS).saturating_add(span.spread_nanos);
+        let sync = SyncSettings { max_wait_nanos: Some(max_wait_nanos), ..self.sync };
+        let mut intake = Intake::start_opening(self.sources, InputFormat::OfRig(rig), &sync, Pacing::Lossless)?;
+        let bar = progress_bar((to_secs * 1e3) as u64, label);
+        let mut first = None;
+        while !intake.ended() && !stop::requested() {
+            let Some(set) = intake.next_set(Duration::from_millis(200)) else { continue };
+            let begin = *first.get_or_insert(set.master_nanos);
+            let at = set.master_nanos.saturating_sub(begin) as f64 * 1e-9;
+            if at > to_secs {
+                break;
+            }
+            bar.set_position((at * 1e3) as u64);
+            if at >= from_secs - JITTER_SECS {
+                each(&set)?;
+            }
+        }
+        bar.finish_and_clear();
+        let error = |slot| intake.last_error(slot).map(|error| error.to_string());
+        Ok(ReadErrors((0..rig.cameras.len()).map(error).collect()))
     }
 }
 
-/// A take with its calibration.
-pub struct CalibratedTake {
-    pub sources: Vec<SourceOpener>,
-    pub is_live: bool,
-    /// The rig and its plates by slot; `None` without a calibration.
-    pub calibration: Option<(Rig, Vec<Option<Image>>)>,
-    /// Whether to use the masks of the take.
-    pub given_masks: bool,
-    /// How frames are joined; its time offsets are subtracted from the timestamps.
-    pub sync: SyncSettings,
+/// Part of a take that [`Take::for_each_set`] reads.
+#[derive(Debug, Clone, Copy)]
+pub struct TakeSpan {
+    /// First and last time, seconds after the first frame set.
+    pub secs: [f64; 2],
+    /// Additional wait of frame sets for late cameras, nanoseconds: waiting loses nothing in stored footage.
+    pub spread_nanos: u64,
 }
 
-impl CalibratedTake {
-    /// Creates the take of a recording, a folder or videos.
-    fn replayed(sources: Vec<SourceOpener>, calibration: Option<(Rig, Vec<Option<Image>>)>, given_masks: bool) -> Self {
-        Self { sources, is_live: false, calibration, given_masks, sync: SyncSettings::default() }
-    }
-}
-
-/// Errors of the images of a take, by slot.
+/// Last read error of each camera of a take.
 pub struct ReadErrors(Vec<Option<String>>);
 
 impl ReadErrors {
-    /// Returns the last error of a camera.
-    pub fn of(&self, slot: usize) -> Option<&str> {
+    /// Returns the last error of the camera in a slot.
+    #[must_use]
+    pub fn get(&self, slot: usize) -> Option<&str> {
         self.0.get(slot)?.as_deref()
     }
 }
 
-/// Calls `each` with every set whose time lies within `secs` (from, to) of the first one's, until Ctrl-C, under a progress bar. Sets
-/// wait for cameras by up to `spread_nanos` longer than usual: nothing is lost by waiting in a recording.
-pub fn each_set(
-    sources: Vec<SourceOpener>,
-    rig: &Rig,
-    sync: SyncSettings,
-    spread_nanos: u64,
-    secs: [f64; 2],
-    label: &'static str,
-    mut each: impl FnMut(&FrameSet) -> Result<()>,
-) -> Result<ReadErrors> {
-    let max_wait_nanos = Some(sync.max_wait_nanos.unwrap_or(1_000_000_000).saturating_add(spread_nanos));
-    let sync = SyncSettings { max_wait_nanos, ..sync };
-    let mut intake = Intake::start_opening(sources, InputFormat::OfRig(rig), &sync, Pacing::Lossless)?;
-    let bar = progress_bar((secs[1] * 1e3) as u64, label);
-    let mut first = None;
-    while !intake.ended() && !stop::requested() {
-        let Some(set) = intake.next_set(Duration::from_millis(200)) else { continue };
-        let from = *first.get_or_insert(set.master_nanos);
-        let at = set.master_nanos.saturating_sub(from) as f64 * 1e-9;
-        if at > secs[1] {
-            break;
-        }
-        bar.set_position((at * 1e3) as u64);
-        // Timestamps jitter by less than a millisecond.
-        if at >= secs[0] - 1e-3 {
-            each(&set)?;
-        }
-    }
-    bar.finish_and_clear();
-    Ok(ReadErrors((0..rig.cameras.len()).map(|slot| intake.last_error(slot).map(|error| error.to_string())).collect()))
-}
-
-/// Opens a take with its calibration: its own, or that of a folder.
-pub fn open_calibrated(
-    input: &[PathBuf],
-    fps: f64,
-    folder_of_calibration: Option<&Path>,
-    gpu: &dyn Fn() -> Result<GpuContext>,
-) -> Result<CalibratedTake> {
-    let mut take = match input {
-        [path] if has_ending(path, "toml") => {
-            let mut config = Config::load(path)?;
-            let is_sim = config.source.kind == SourceKind::Sim;
-            // Simulated cameras can wait.
-            config.source.real_time &= !is_sim;
-            let gpu = is_sim.then(gpu).transpose()?;
-            let is_live = config.source.kind.is_live();
-            let source = source::open(&config, gpu.as_ref())?;
-            let given_masks = config.perception.masks == Origin::Given;
-            CalibratedTake {
-                sources: source.cameras,
-                is_live,
-                calibration: Some((source.rig, source.plates)),
-                given_masks,
-                sync: config.sync,
-            }
-        }
-        [path] if has_ending(path, "mcap") => {
-            let (cameras, rig) = recording::recorded_cameras(path)?;
-            let sources = source::ready(recording::replay_sources(path, &cameras)?);
-            let without_plates = |rig: Rig| {
-                let plates = rig.cameras.iter().map(|_| None).collect();
-                (rig, plates)
-            };
-            CalibratedTake::replayed(sources, rig.map(without_plates), false)
-        }
-        [folder] if folder.is_dir() => {
-            let has = |file: &str| folder.join(file).exists();
-            let is_calibrated = has("calibration.toml") || has("intri.yml") && has("extri.yml");
-            let mut sources = folder_sources(folder, fps, false)?;
-            let masks = folder.join("mask");
-            let with_masks = (is_calibrated || folder_of_calibration.is_some())
-                && sources.iter().all(|source| masks.join(source.camera().as_str()).is_dir());
-            if with_masks {
-                sources = folder_sources(folder, fps, true)?;
-            }
-            let calibration = (is_calibrated && folder_of_calibration.is_none())
-                .then(|| calibration(folder, &sources))
-                .transpose()?;
-            CalibratedTake::replayed(sources, calibration, with_masks)
-        }
-        [path] => {
-            bail!("{} is no configuration, recording or folder; name several videos, or one of these", path.display())
-        }
-        videos => CalibratedTake::replayed(video_sources(videos)?, None, false),
-    };
-    if let Some(folder) = folder_of_calibration {
-        ensure!(
-            !take.is_live,
-            "--calibration looks at every frame, which takes longer than live cameras wait; record them first (flyrig \
-             record) and give the recording"
-        );
-        take.calibration = Some(calibration(folder, &take.sources)?);
-    }
-    if let Some((rig, _)) = &take.calibration {
-        take.sync = take.sync.with_offsets_of(&rig.cameras);
-    }
-    Ok(take)
-}
-
-/// Reads calibration and plates of the sources' cameras from a folder.
-fn calibration(folder: &Path, sources: &[SourceOpener]) -> Result<(Rig, Vec<Option<Image>>)> {
-    let cameras: Vec<CameraId> = sources.iter().map(|source| source.camera().clone()).collect();
-    let names: Vec<String> = cameras.iter().map(CameraId::to_string).collect();
-    let rig = dataset::pick(&dataset::load_rig(folder, &cameras)?, &names, "the calibration")?;
-    let plates = dataset::plates(&folder.join("background"), &rig)?;
-    Ok((rig, plates))
-}
-
-fn has_ending(path: &Path, ending: &str) -> bool {
-    path.extension().is_some_and(|found| found.eq_ignore_ascii_case(ending))
-}
-
-fn folder_sources(folder: &Path, fps: f64, with_masks: bool) -> Result<Vec<SourceOpener>> {
-    let options = FolderOptions { fps, with_masks, ..FolderOptions::default() };
-    Ok(source::ready(FolderReplay::open(folder, None, &options)?))
-}
-
-fn video_sources(videos: &[PathBuf]) -> Result<Vec<SourceOpener>> {
-    let video = |path: &PathBuf| -> Result<VideoReplay> {
-        let name = path.file_stem().map(|stem| stem.to_string_lossy().into_owned()).unwrap_or_default();
-        Ok(VideoReplay::open(&name.into(), path, &VideoOptions::default())?)
-    };
-    Ok(source::ready(videos.iter().map(video).collect::<Result<_>>()?))
+/// Wraps opened sources for the capture threads.
+pub(crate) fn ready(sources: Vec<Box<dyn CameraSource>>) -> Vec<SourceOpener> {
+    sources.into_iter().map(SourceOpener::ready).collect()
 }

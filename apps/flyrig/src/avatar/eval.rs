@@ -7,7 +7,8 @@ use flyrig_avatar::{Avatar, DetailedScene};
 use flyrig_fusion::{BodySettings, Outcome, PersonId, Solver};
 use flyrig_gpu::GpuContext;
 use flyrig_metrics::{CameraScore, FrameScore, ScoreSheet, error_parts, score_view};
-use flyrig_report::{frame_number, png, progress_bar, write_whole};
+use flyrig_report::{png, progress_bar, write_whole};
+use flyrig_takes::frame_number;
 use serde::Serialize;
 
 use super::{arguments::EvalArgs, load, open_replay, parts::score_parts, print_far};

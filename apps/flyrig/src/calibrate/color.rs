@@ -9,15 +9,13 @@ use flyrig_fusion::{
 };
 use flyrig_gpu::GpuContext;
 use flyrig_report::{stop, write_whole};
+use flyrig_takes::{Calibration, Take, TakeOptions, TakeSpan};
 use flyrig_types::{CameraId, ColorMatch, FrameSet, Rig};
 use glam::DVec2;
 use serde_json::json;
 
 use super::{FILES, refuse_existing};
-use crate::{
-    cli::CalibrateColorArgs,
-    take::{self, CalibratedTake},
-};
+use crate::{cli::CalibrateColorArgs, opening::open_take};
 
 /// Gaussians on a person: enough for colours, in a quarter of the time.
 const GAUSSIANS: usize = 30_000;
@@ -41,13 +39,15 @@ const MOST_HALVES: f64 = 0.03;
 pub fn color(args: &CalibrateColorArgs, gpu: &dyn Fn() -> Result<GpuContext>) -> Result<()> {
     stop::flag();
     refuse_existing(&args.out, &FILES, args.force)?;
-    let open = || take::open_calibrated(&args.input, args.fps, args.calibration.as_deref(), gpu);
+    let calibration = args.calibration.as_deref();
+    let options = TakeOptions { fps: args.fps, calibration, ..TakeOptions::default() };
+    let open = || open_take(&args.input, &options, gpu);
     let mut take = open()?;
     ensure!(
         !take.is_live,
         "live cameras cannot be looked at frame by frame; record them first (flyrig record) and give the recording"
     );
-    let (mut rig, plates) = take
+    let Calibration { mut rig, plates } = take
         .calibration
         .take()
         .context("no calibration: name its folder with --calibration; flyrig calibrate rig makes one from a board")?;
@@ -88,10 +88,10 @@ pub fn color(args: &CalibrateColorArgs, gpu: &dyn Fn() -> Result<GpuContext>) ->
 }
 
 /// Returns sets of the first seconds, from which shapes are measured.
-fn first_sets(args: &CalibrateColorArgs, rig: &Rig, take: CalibratedTake) -> Result<Vec<FrameSet>> {
+fn first_sets(args: &CalibrateColorArgs, rig: &Rig, take: Take) -> Result<Vec<FrameSet>> {
     let secs = [args.from_secs, args.from_secs + SHAPE_SECS];
     let (mut sets, mut first): (Vec<FrameSet>, _) = (Vec::new(), None);
-    take::each_set(take.sources, rig, take.sync, 0, secs, "the person's shape, ms of the take", |set| {
+    take.for_each_set(rig, TakeSpan { secs, spread_nanos: 0 }, "the person's shape, ms of the take", |set| {
         let from = *first.get_or_insert(set.master_nanos);
         let due = SHAPE_SECS * sets.len() as f64 / SHAPE_SETS as f64;
         if set.master_nanos.saturating_sub(from) as f64 * 1e-9 >= due - 1e-3 {
@@ -103,15 +103,10 @@ fn first_sets(args: &CalibrateColorArgs, rig: &Rig, take: CalibratedTake) -> Res
 }
 
 /// Follows people through the take and collects what cameras see of their surfaces.
-fn look_through(
-    args: &CalibrateColorArgs,
-    rig: &Rig,
-    session: &mut Session,
-    take: CalibratedTake,
-) -> Result<Vec<ColorPoint>> {
+fn look_through(args: &CalibrateColorArgs, rig: &Rig, session: &mut Session, take: Take) -> Result<Vec<ColorPoint>> {
     let secs = [args.from_secs, args.from_secs + args.secs];
     let (mut points, mut sets) = (Vec::new(), 0u64);
-    let errors = take::each_set(take.sources, rig, take.sync, 0, secs, "colours, ms of the take", |set| {
+    let errors = take.for_each_set(rig, TakeSpan { secs, spread_nanos: 0 }, "colours, ms of the take", |set| {
         session.process(set)?;
         sets += 1;
         if !sets.is_multiple_of(EVERY) {
@@ -126,7 +121,7 @@ fn look_through(
         Ok(())
     })?;
     for (slot, camera) in rig.cameras.iter().enumerate() {
-        if let Some(error) = errors.of(slot) {
+        if let Some(error) = errors.get(slot) {
             eprintln!("warning: not every image of camera {} could be used; the last: {error}", camera.id);
         }
     }

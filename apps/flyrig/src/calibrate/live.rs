@@ -21,12 +21,9 @@ use super::{
     advice::{Progress, Step, different},
     page, refuse_existing,
     rig::{self, PAGE, Target},
-    views::Seen,
+    views::{Seen, open_frames},
 };
-use crate::{
-    cli::{CalibrateLiveArgs, TakeArgs},
-    take,
-};
+use crate::cli::{CalibrateLiveArgs, TakeArgs};
 
 /// Time between two looks at what is missing, and between two solves.
 const LOOK_EVERY: Duration = Duration::from_millis(500);
@@ -44,7 +41,7 @@ pub fn live(args: &CalibrateLiveArgs, gpu: &dyn Fn() -> Result<GpuContext>) -> R
     let board = Board::load(&args.board)?;
     refuse_existing(&args.out, &[&FILES[..], &[PAGE]].concat(), args.force)?;
     let take_args = TakeArgs { input: args.input.clone(), secs: args.secs, every_ms: args.every_ms, fps: args.fps };
-    let opened = take::open(&take_args.input, take_args.fps, gpu)?;
+    let opened = open_frames(&take_args, gpu)?;
     let ids: Vec<CameraId> = opened.sources.iter().map(|source| source.camera().clone()).collect();
     ensure!(ids.len() > 1, "one camera alone is no rig; flyrig calibrate lens calibrates it");
     let server = PageServer::start("--listen", &args.listen, "text/html; charset=utf-8")?;

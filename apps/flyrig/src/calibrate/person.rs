@@ -8,16 +8,14 @@ use flyrig_calib::{
 use flyrig_gpu::GpuContext;
 use flyrig_report::{stop, write_whole};
 use flyrig_sync::{HullCorner, silhouette_hull};
+use flyrig_takes::{Calibration, Take, TakeOptions, TakeSpan};
 use flyrig_tracker::{PoseConfig, PoseNet, Viewers};
 use flyrig_types::{Camera, Image, Rig};
 use glam::DVec2;
 use serde_json::json;
 
 use super::{FILES, refuse_existing};
-use crate::{
-    cli::CalibratePersonArgs,
-    take::{self, CalibratedTake},
-};
+use crate::{cli::CalibratePersonArgs, opening::open_take};
 
 /// Landmarks in use, by their index in the network: nose, eyes, ears, shoulders to wrists, index fingers, hips to toes.
 const LANDMARKS: [usize; 23] = [0, 2, 5, 7, 8, 11, 12, 13, 14, 15, 16, 19, 20, 23, 24, 25, 26, 27, 28, 29, 30, 31, 32];
@@ -61,12 +59,14 @@ const CONFIDENCE: f64 = 0.3;
 pub fn person(args: &CalibratePersonArgs, gpu: &dyn Fn() -> Result<GpuContext>) -> Result<()> {
     stop::flag();
     refuse_existing(&args.out, &FILES, args.force)?;
-    let mut take = take::open_calibrated(&args.input, args.fps, args.calibration.as_deref(), gpu)?;
+    let calibration = args.calibration.as_deref();
+    let options = TakeOptions { fps: args.fps, calibration, ..TakeOptions::default() };
+    let mut take = open_take(&args.input, &options, gpu)?;
     ensure!(
         !take.is_live,
         "live cameras cannot be looked at frame by frame; record them first (flyrig record) and give the recording"
     );
-    let (rig, plates) = take
+    let Calibration { rig, plates } = take
         .calibration
         .take()
         .context("no calibration: name its folder with --calibration; flyrig calibrate rig makes one from a board")?;
@@ -115,17 +115,12 @@ pub fn person(args: &CalibratePersonArgs, gpu: &dyn Fn() -> Result<GpuContext>) 
 }
 
 /// Finds landmarks and silhouettes of the person in all images.
-fn look_through(
-    args: &CalibratePersonArgs,
-    rig: &Rig,
-    plates: Vec<Option<Image>>,
-    take: CalibratedTake,
-) -> Result<PersonTracks> {
+fn look_through(args: &CalibratePersonArgs, rig: &Rig, plates: Vec<Option<Image>>, take: Take) -> Result<PersonTracks> {
     let template = default_template(&ShapeParams::default())?;
     let mut viewers = Viewers::new(&PoseNet::embedded()?, &template, rig, plates, &PoseConfig::default())?;
     let mut tracks = PersonTracks::new(rig.cameras.len(), LANDMARKS.len());
     let secs = [args.from_secs, args.from_secs + args.secs];
-    let errors = take::each_set(take.sources, rig, take.sync, 0, secs, "the person, ms of the take", |set| {
+    let errors = take.for_each_set(rig, TakeSpan { secs, spread_nanos: 0 }, "the person, ms of the take", |set| {
         for (slot, found) in viewers.look(set)?.into_iter().enumerate() {
             let (Some(found), Some(frame)) = (found, &set.frames[slot]) else { continue };
             if let Some(mask) = found.masks.iter().flatten().next() {
@@ -146,7 +141,7 @@ fn look_through(
         Ok(())
     })?;
     for (slot, camera) in rig.cameras.iter().enumerate() {
-        if let Some(error) = errors.of(slot) {
+        if let Some(error) = errors.get(slot) {
             eprintln!("warning: not every image of camera {} could be used; the last: {error}", camera.id);
         }
         ensure!(

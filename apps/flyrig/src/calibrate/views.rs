@@ -12,19 +12,23 @@ use flyrig_fusion::{InputFormat, Intake};
 use flyrig_gpu::GpuContext;
 use flyrig_report::{progress_bar, stop};
 use flyrig_sync::SyncSettings;
+use flyrig_takes::{Needs, Take, TakeOptions};
 use flyrig_types::{CameraId, FrameSet};
 use rayon::prelude::*;
 
-use crate::{
-    cli::TakeArgs,
-    take::{self, Take},
-};
+use crate::{cli::TakeArgs, opening::open_take};
 
 /// Images that are looked at together.
 const BATCH: usize = 16;
 
 /// Seconds that live cameras may take until their first frame.
 const PATIENCE_SECS: f64 = 15.0;
+
+/// Opens the frames of a take. `gpu` opens a graphics adapter, for simulated cameras alone.
+pub fn open_frames(args: &TakeArgs, gpu: &dyn Fn() -> Result<GpuContext>) -> Result<Take> {
+    let options = TakeOptions { fps: args.fps, needs: Needs::Frames, ..TakeOptions::default() };
+    open_take(&args.input, &options, gpu)
+}
 
 /// Boards that were seen in a take.
 pub struct Seen {
@@ -43,7 +47,7 @@ impl Seen {
     /// Opens a take and looks for the board; every camera must see it. `gpu` opens a graphics adapter, for simulated cameras alone.
     pub fn find(args: &TakeArgs, board: &Board, gpu: &dyn Fn() -> Result<GpuContext>) -> Result<Self> {
         let bar = progress_bar((args.secs * 1e3) as u64, "boards, ms of the take");
-        let seen = Self::look_through(take::open(&args.input, args.fps, gpu)?, board, args, |seen, at| {
+        let seen = Self::look_through(open_frames(args, gpu)?, board, args, |seen, at| {
             bar.set_position((at * 1e3) as u64);
             bar.set_message(format!("{} boards", seen.shots.iter().map(|shot| shot.views.len()).sum::<usize>()));
             Ok(ControlFlow::Continue(()))
@@ -66,8 +70,8 @@ impl Seen {
         let count = ids.len();
         let mut seen =
             Self { ids, sizes: vec![None; count], shots: Vec::new(), images: vec![0; count], begin_nanos: 0 };
-        let mut intake =
-            Intake::start_opening(take.sources, InputFormat::AnySize, &SyncSettings::default(), take.pacing)?;
+        let pacing = take.pacing();
+        let mut intake = Intake::start_opening(take.sources, InputFormat::AnySize, &SyncSettings::default(), pacing)?;
         let started = Instant::now();
         let (mut first, mut next, mut batch) = (None, i64::MIN, Vec::new());
         while !intake.ended() && !stop::requested() {
