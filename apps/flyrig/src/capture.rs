@@ -1,4 +1,4 @@
-//! `flyrig capture`: the cameras of this computer, for a rig that runs on another one.
+//! `flyrig capture`: publishes the cameras of this computer for a rig on another one.
 
 use std::{
     path::Path,
@@ -21,11 +21,11 @@ use flyrig_types::{CameraId, Frame};
 
 use crate::{config::Config, opening::open_cameras};
 
-/// How often the state of cameras is published.
+/// Interval at which the state of cameras is published.
 const STATUS_EVERY: Duration = Duration::from_secs(1);
-/// How often a line with counts is printed.
+/// Interval between lines with counts.
 const PRINT_EVERY: Duration = Duration::from_secs(5);
-/// The last error of a camera without frames for so long is published.
+/// Silence of a camera after which its last error is published.
 const SILENT: Duration = Duration::from_secs(1);
 
 /// Runs the command until it is stopped or every recorded camera has ended. With a key, the cameras go to the key's rig.
@@ -142,7 +142,7 @@ fn status(host: &str, stats: &CameraStats, is_silent: bool) -> CameraStatus {
     }
 }
 
-/// What people call this computer.
+/// Returns the name of this computer.
 fn host_name() -> String {
     let read = |path: &str| std::fs::read_to_string(Path::new(path)).ok().map(|name| name.trim().to_owned());
     read("/proc/sys/kernel/hostname").or_else(|| std::env::var("COMPUTERNAME").ok()).unwrap_or_default()

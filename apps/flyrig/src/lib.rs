@@ -41,15 +41,15 @@ use crate::{
     config::{Config, DEFAULT_TOML},
 };
 
-/// Reads and checks a configuration; the error is what `flyrig config check` says.
+/// Checks the text of a configuration; the error is that of `flyrig config check`.
 ///
 /// # Errors
-/// Names the key, what was found, and what is expected.
+/// Names the key, its value, and the expected values.
 pub fn check_config(text: &str) -> Result<(), String> {
     Config::parse(text).map(|_| ()).map_err(|error| program::one_line(&error))
 }
 
-/// Runs the command line of this process. For the beginning of `main`, before any other thread runs.
+/// Runs the command line of this process. Call it at the beginning of `main`, before any other thread starts.
 #[must_use]
 #[allow(unsafe_code)]
 pub fn main() -> ExitCode {

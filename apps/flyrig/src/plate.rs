@@ -1,4 +1,4 @@
-//! `flyrig plate`: records the empty scene, with which masks compare the images.
+//! `flyrig plate`: records plates, images of the empty scene that masks are computed against.
 
 use std::{
     path::PathBuf,
@@ -15,13 +15,13 @@ use flyrig_types::{CameraId, Frame, Image, PixelFormat};
 
 use crate::{cli::PlateArgs, opening::open_take};
 
-/// Frames of a camera that the median is taken over, spread over the time.
+/// Number of frames per camera in the median, spread over the time.
 const FRAMES: usize = 25;
-/// Seconds that live cameras may take until their first frame.
+/// Time that live cameras have for their first frame, seconds.
 const PATIENCE_SECS: f64 = 10.0;
-/// A channel that is farther from the median shows something that moved, sRGB steps.
+/// Difference of a channel from the median beyond which something moved, sRGB bytes.
 const MOVED: u8 = 28;
-/// Share of the frames in which a pixel of a still scene may have moved, and share of the pixels that may.
+/// Largest fraction of frames in which a still pixel may have moved, and of pixels that may have moved more often.
 const MOVED_FRAMES: f64 = 0.2;
 const MOVED_PIXELS: f64 = 0.01;
 
@@ -112,15 +112,15 @@ struct Scene {
     secs: f64,
     size: [u32; 2],
     first_nanos: Option<i64>,
-    /// RGB.
+    /// RGB bytes of each frame.
     frames: Vec<Vec<u8>>,
     full: bool,
 }
 
-/// The empty scene of one camera.
+/// Empty scene of one camera.
 struct Plate {
     image: Image,
-    /// Share of the pixels that moved.
+    /// Fraction of the pixels that moved.
     moved: f64,
 }
 
@@ -129,7 +129,7 @@ impl Scene {
         Self { camera, secs, size: [0; 2], first_nanos: None, frames: Vec::new(), full: false }
     }
 
-    /// Takes the frame when it is due.
+    /// Keeps the frame if it is due.
     fn add(&mut self, frame: &Frame) -> Result<()> {
         let first = *self.first_nanos.get_or_insert(frame.capture_nanos);
         let at = frame.capture_nanos.saturating_sub(first) as f64 * 1e-9;
@@ -137,7 +137,7 @@ impl Scene {
         if self.full || at < self.secs * self.frames.len() as f64 / FRAMES as f64 {
             return Ok(());
         }
-        // A damaged frame is left out; without any the camera is named.
+        // Damaged frames are skipped; a camera without any frame is reported later.
         let Ok(rgb) = to_rgb8(&frame.image) else { return Ok(()) };
         let size = [frame.image.width(), frame.image.height()];
         if self.frames.is_empty() {
@@ -156,7 +156,7 @@ impl Scene {
         Ok(())
     }
 
-    /// The median of each channel of each pixel over the frames.
+    /// Computes the median over the frames for each channel of each pixel.
     fn plate(&self) -> Result<Plate> {
         let count = self.frames.len();
         let length = self.frames.first().map_or(0, Vec::len);

@@ -82,7 +82,7 @@ impl RigRun<'_> {
         if let Some(watch) = watch {
             rig = rig.with_watch(watch);
         }
-        let mut live = LiveRun::new(self, rig, recording)?;
+        let mut live = LiveRun::new(config, rig, self.recorder, recording, !self.show_table)?;
         live.run_until_end(monitor)?;
         let ended = live.finish();
         drop(web);

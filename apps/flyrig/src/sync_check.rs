@@ -1,4 +1,4 @@
-//! `flyrig sync-check`: do the cameras' stamps agree with what moves in their images?
+//! `flyrig sync-check`: estimates the cameras' time offsets from motion in their images.
 
 use std::time::{Duration, Instant};
 
@@ -63,7 +63,7 @@ pub fn sync_check(args: &SyncCheckArgs, gpu: &dyn Fn() -> Result<GpuContext>) ->
     Ok(())
 }
 
-/// The lags by what moves in the images, and how many images of each camera were compared.
+/// Estimates the time offsets from motion in the images; returns them with the number of compared images per camera.
 fn by_motion(
     args: &SyncCheckArgs,
     sources: Vec<SourceOpener>,
@@ -124,7 +124,7 @@ fn print(estimates: &[LagEstimate], frames: &[usize]) {
     }
 }
 
-/// By the silhouettes of a person.
+/// Estimates the time offsets from a person's silhouettes; returns them with the number of silhouettes per camera.
 fn by_silhouettes(
     args: &SyncCheckArgs,
     rig: &Rig,
@@ -133,7 +133,7 @@ fn by_silhouettes(
 ) -> Result<(Vec<LagEstimate>, Vec<usize>)> {
     let mut silhouettes = SilhouetteFinder::new(rig, plates, take.given_masks)?;
     let mut pictures = vec![0usize; rig.cameras.len()];
-    // One camera may be ahead by as much as another is behind.
+    // One camera may lead by as much as another lags.
     let spread_nanos = (args.most_ms * 2e6) as u64;
     let span = TakeSpan { secs: [args.from_secs, args.from_secs + args.seconds], spread_nanos };
     let errors = take.for_each_set(rig, span, "silhouettes, ms of the take", |set| {
@@ -164,9 +164,9 @@ mod tests {
 
     const NAMES: [&str; 4] = ["00", "02", "03", "05"];
 
-    /// Four of seven simulated cameras whose stamps are off by random lags.
+    /// Four of seven simulated cameras whose timestamps have random offsets.
     struct Lagging {
-        /// Milliseconds after the first camera.
+        /// Offset from the first camera, milliseconds.
         lags_ms: [f64; 4],
         rig: Rig,
         sources: Vec<SourceOpener>,
@@ -200,7 +200,7 @@ mod tests {
             Self { lags_ms: lags_ms.map(|lag| lag - lags_ms[0]), rig, sources }
         }
 
-        /// By what was found, off by how many milliseconds, if anything was found; the standard error or disagreement.
+        /// Returns the error of each estimate (milliseconds; `None` if there is none) with its standard error or disagreement.
         fn off(&self, estimates: &[LagEstimate]) -> Vec<(Option<f64>, f64)> {
             let off = |(estimate, lag): (&LagEstimate, f64)| {
                 let off = estimate.lag_nanos.map(|found| found as f64 * 1e-6 - lag);
@@ -217,7 +217,7 @@ mod tests {
             self.off(&estimates)
         }
 
-        /// With silhouettes that are found in the images, without plates.
+        /// Estimates from silhouettes that are found in the images, without plates.
         fn by_silhouettes(mut self) -> Vec<(Option<f64>, f64)> {
             let take = Take::from_sources(std::mem::take(&mut self.sources));
             let (estimates, frames) = by_silhouettes(&args(), &self.rig, NAMES.map(|_| None).into(), take).unwrap();
@@ -250,7 +250,7 @@ mod tests {
     #[ignore = "minutes: run by make test-long"]
     fn lags_by_motion_are_right_or_not_told() {
         let gpu = GpuContext::new(&AdapterChoice::Best).unwrap();
-        // Slow movements look different from every side: no answer is better than a wrong one.
+        // Slow movements look different from every side: no estimate is better than a wrong one.
         let waving = (2..6).map(|seed| (MotionKind::Wave, seed));
         for (kind, seed) in waving.chain([(MotionKind::Squat, 6), (MotionKind::Turn, 7)]) {
             println!("{kind:?} {seed}");

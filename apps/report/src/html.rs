@@ -1,4 +1,4 @@
-//! A self-contained HTML page: images, scores, times, memory.
+//! Self-contained HTML pages: images, scores, times, memory.
 
 use std::{fmt::Write as _, io::Write as _, path::Path};
 
@@ -14,15 +14,15 @@ use crate::plot::{Line, Plot, Series};
 pub struct Report {
     /// Heading of the page.
     pub title: String,
-    /// Seconds after which browsers load the page again; `None` for a page that stays as it is.
+    /// Interval at which browsers reload the page, seconds; `None` for a static page.
     pub refresh_secs: Option<u32>,
     /// Name and value pairs: adapter, commit, frame rate, counts.
     pub facts: Vec<(String, String)>,
-    /// Sentences below the heading: what the page says in short.
+    /// Summary below the heading.
     pub sentences: Vec<String>,
     /// Tables of text.
     pub tables: Vec<Table>,
-    /// Heading and SVG of each drawing.
+    /// Heading and SVG of each drawing; the SVG is inserted unescaped.
     pub drawings: Vec<(String, String)>,
     /// Heading and rows of each table of scores.
     pub scores: Vec<(String, Vec<CameraScore>)>,
@@ -34,7 +34,7 @@ pub struct Report {
     pub contact: Vec<ContactRow>,
 }
 
-/// A table of text.
+/// Table of text.
 #[derive(Debug, Default)]
 pub struct Table {
     /// Heading.
@@ -45,7 +45,7 @@ pub struct Table {
     pub rows: Vec<Vec<String>>,
 }
 
-/// A line plot.
+/// Line plot.
 #[derive(Debug)]
 pub struct Curve {
     /// Heading.
@@ -58,7 +58,7 @@ pub struct Curve {
     pub lines: Vec<(String, Vec<(f64, f64)>)>,
 }
 
-/// A row of the contact sheet.
+/// Row of the contact sheet.
 #[derive(Debug)]
 pub struct ContactRow {
     /// Caption of the row.
@@ -169,7 +169,7 @@ impl Report {
     /// Writes the page, whole or not at all.
     ///
     /// # Errors
-    /// When the file cannot be written.
+    /// The file cannot be written.
     pub fn save(&self, path: &Path) -> Result<()> {
         write_whole(path, self.html().as_bytes())
     }
@@ -178,7 +178,7 @@ impl Report {
 /// Writes a file whole or not at all.
 ///
 /// # Errors
-/// Names the file and the fix.
+/// The file cannot be written; names the file and the fix.
 pub fn write_whole(path: &Path, bytes: &[u8]) -> Result<()> {
     flyrig_types::write_whole(path, |out| out.write_all(bytes))
         .with_context(|| format!("cannot write {}; check that the folder exists and has room", path.display()))
@@ -202,7 +202,7 @@ impl Curve {
         if plot.is_empty() {
             return "<p>no values</p>".to_owned();
         }
-        // Inside of a page the namespace goes without saying.
+        // Inside an HTML page the namespace is implied.
         plot.strip().replacen(" xmlns=\"http://www.w3.org/2000/svg\"", "", 1)
     }
 }

@@ -1,4 +1,4 @@
-//! Shared by the programs: HTML reports, plots, images, progress bars, logging, arguments, and Ctrl-C as a flag.
+//! HTML reports, plots, images, progress bars, logging, arguments and the Ctrl-C flag of the programs.
 
 pub mod arguments;
 mod contact;

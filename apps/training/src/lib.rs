@@ -1,7 +1,7 @@
 //! Training of the networks for learned appearance, from simulated people and recorded rigs.
 //!
-//! Everything lies in one folder and survives being killed at any time: samples are made once and kept as files, the
-//! state of the training is written whole every few hundred steps.
+//! All files lie in one folder, and a killed training resumes from them: samples are made once and kept as files, the
+//! state of the training is written every few hundred steps, whole or not at all.
 
 mod arguments;
 mod gather;
@@ -26,19 +26,19 @@ use self::{
     report::{Progress, Scores},
 };
 
-/// Added to the seed of the people that only measure progress.
+/// Offset of the seed of the test people, who only measure progress.
 const HELD_OUT_SEED: u64 = 1 << 40;
 /// Steps between two checkpoints.
 const CHECKPOINT_STEPS: u64 = 250;
 
-/// Makes samples, trains, and writes weights and curves into the folder of the arguments; `gpu` opens the adapter where one is needed.
+/// Makes samples, trains, and writes weights and curves to the folder of the arguments. `gpu` opens the graphics adapter if one is needed.
 ///
 /// # Errors
-/// Names what is missing, damaged, or in contradiction to a checkpoint in the folder.
+/// Names a file or setting that is missing, damaged, or contradicts a checkpoint in the folder.
 pub fn train(args: &TrainArgs, gpu: &dyn Fn() -> Result<GpuContext>) -> Result<()> {
     stop::flag();
     let started = Instant::now();
-    // What is asked for in vain is told before hours of simulation.
+    // Wrong arguments are reported before hours of simulation.
     let begin = begin(args)?;
     let device = match args.networks_on {
         NetworksOn::Processor => NetworkDevice::processor(),
@@ -101,7 +101,7 @@ pub fn train(args: &TrainArgs, gpu: &dyn Fn() -> Result<GpuContext>) -> Result<(
                 progress.scores.extend(score(&trainer, &test));
             }
             progress.save(&args.out)?;
-            // Last: what a checkpoint tells has been written.
+            // Last: the files that belong to the checkpoint have been written.
             trainer.save(&checkpoint)?;
             save_weights(args, &trainer, &progress, &people, samples.len(), started)?;
         }
@@ -119,7 +119,7 @@ pub fn train(args: &TrainArgs, gpu: &dyn Fn() -> Result<GpuContext>) -> Result<(
     Ok(())
 }
 
-/// What a training that is new starts from.
+/// Returns the initial parameters of a new training.
 fn begin(args: &TrainArgs) -> Result<Parameters> {
     Ok(match &args.from {
         None => Parameters::untrained(args.size.size(), args.seed),
@@ -127,14 +127,14 @@ fn begin(args: &TrainArgs) -> Result<Parameters> {
     })
 }
 
-/// None without anybody to measure on.
+/// Measures the scores on the test people; `None` without any.
 fn score(trainer: &Trainer, test: &[TrainingSample]) -> Option<Scores> {
     let errors: Vec<SampleErrors> =
         test.iter().filter_map(|sample| evaluate(&trainer.parameters, sample, true)).collect();
     (!errors.is_empty()).then(|| Scores::new(trainer.step, &errors))
 }
 
-/// Samples of simulated people, out of the folder as far as they lie there.
+/// Returns samples of simulated people; simulates those that the folder lacks.
 fn simulated(
     args: &TrainArgs,
     people: &People,
@@ -173,7 +173,7 @@ fn simulated(
     Ok(samples)
 }
 
-/// All samples of these folders.
+/// Reads all samples of these folders.
 fn read_extra(folders: &[PathBuf]) -> Result<Vec<TrainingSample>> {
     let mut samples = Vec::new();
     for folder in folders {
@@ -213,7 +213,7 @@ fn save_weights(
     write_whole(&args.out.join("weights.json"), &json)
 }
 
-/// The command as it was typed, folders shortened to their names.
+/// Returns the command line, with paths shortened to their last part.
 fn command_line() -> String {
     let short =
         |word: String| Path::new(&word).file_name().map_or(word.clone(), |name| name.to_string_lossy().into_owned());

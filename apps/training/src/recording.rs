@@ -17,7 +17,7 @@ use super::{
     gather::{HeldOut, gather},
 };
 
-/// Writes what is missing of a data set's samples into a folder below `out`, and tells which one.
+/// Writes the missing samples of a data set to a folder below `out`, and returns the folder.
 pub fn record(args: &TrainArgs, root: &Path, out: &Path, gpu: &GpuContext) -> Result<PathBuf> {
     let name = root.file_name().map_or_else(|| "dataset".to_owned(), |name| name.to_string_lossy().into_owned());
     let folder = out.join(format!("recorded-{name}"));

@@ -19,7 +19,7 @@ use flyrig_types::Camera;
 use super::{
     arguments::{Atlas, BuildArgs, LocalArgs, Method, Order},
     checkpoint::Checkpoint,
-    open_replay,
+    inputs::open_replay,
 };
 
 /// Number of steps from which the time of a step is measured.

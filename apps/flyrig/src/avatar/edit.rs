@@ -1,9 +1,9 @@
-//! `flyrig avatar edit`: another texture, another shape.
+//! `flyrig avatar edit`: replaces texture or shape.
 
 use anyhow::{Result, ensure};
 use flyrig_body::ShapeParams;
 
-use super::{arguments::EditArgs, export::read_texture, load};
+use super::{arguments::EditArgs, export::read_texture, inputs::load};
 
 /// Runs the command.
 pub fn edit(args: &EditArgs) -> Result<()> {

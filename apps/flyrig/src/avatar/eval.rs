@@ -1,4 +1,4 @@
-//! `flyrig avatar eval`: an avatar against held-out cameras.
+//! `flyrig avatar eval`: scores an avatar against held-out cameras.
 
 use std::time::{Duration, Instant};
 
@@ -11,7 +11,11 @@ use flyrig_report::{png, progress_bar, write_whole};
 use flyrig_takes::frame_number;
 use serde::Serialize;
 
-use super::{arguments::EvalArgs, load, open_replay, parts::score_parts, print_far};
+use super::{
+    arguments::EvalArgs,
+    inputs::{load, open_replay, print_far},
+    parts::score_parts,
+};
 
 #[derive(Debug, Serialize)]
 struct Metrics<'a> {
@@ -20,17 +24,17 @@ struct Metrics<'a> {
     holdout: &'a [String],
     deformed: bool,
     gaussians: usize,
-    /// Gaussians of a view, after those that pixels do not tell apart were merged.
+    /// Mean number of Gaussians per view, after merging those that pixels do not resolve.
     mean_drawn: f64,
     adapter: String,
     mean: Option<CameraScore>,
     cameras: Vec<CameraScore>,
     per_frame: &'a [FrameScore],
-    /// Boxes around head and hands.
+    /// Scores of the boxes around head and hands.
     parts: Vec<CameraScore>,
-    /// Mean share of the Gaussians in poses unlike those of the take.
+    /// Mean fraction of the Gaussians in poses unlike those of the take.
     far_share: f64,
-    /// Mean time of posing and drawing a view, reading back included, milliseconds.
+    /// Mean time to pose and render a view, read-back included, milliseconds.
     view_ms: f64,
 }
 
@@ -53,7 +57,7 @@ pub fn eval(args: &EvalArgs, gpu: &GpuContext) -> Result<()> {
     let gaussians = scene.avatar().gaussians();
     let bar = progress_bar(replay.count as u64, "avatar eval");
     let (mut sheet, mut spent, mut views_drawn) = (ScoreSheet::default(), Duration::ZERO, 0u32);
-    // Gaussians of all views, and those among them that face away.
+    // Numbers of Gaussians of all views, and of those that face away.
     let (mut drawn, mut hidden) = (0, 0);
     let (mut parts, mut far, mut frames) = (ScoreSheet::default(), 0.0, 0u32);
     while let Some(set) = replay.next_set()? {
@@ -128,7 +132,7 @@ pub fn eval(args: &EvalArgs, gpu: &GpuContext) -> Result<()> {
     Ok(())
 }
 
-/// Checks that a pose is one of the avatar's skeleton.
+/// Checks that a pose fits the avatar's skeleton.
 fn fits(avatar: &Avatar, skeleton: &flyrig_body::Skeleton, pose: &flyrig_types::Pose) -> Result<()> {
     let names = |skeleton: &flyrig_body::Skeleton| -> Vec<String> {
         skeleton.joints().iter().map(|joint| joint.name.clone()).collect()

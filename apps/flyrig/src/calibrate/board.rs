@@ -4,7 +4,7 @@ use anyhow::{Context as _, Result, anyhow};
 use flyrig_calib::{Board, BoardSheet, Pattern};
 use flyrig_report::write_whole;
 
-use super::refuse_existing;
+use super::output::refuse_existing;
 use crate::cli::{CalibrateBoardArgs, Paper, PatternName};
 
 /// Runs the command.

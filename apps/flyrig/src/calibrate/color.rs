@@ -1,4 +1,4 @@
-//! `flyrig calibrate color`: colours of the cameras, matched by people whom several of them see.
+//! `flyrig calibrate color`: matches the cameras' colours on people whom several of them see.
 
 use anyhow::{Context as _, Result, ensure};
 use flyrig_body::{ShapeParams, default_template};
@@ -14,25 +14,25 @@ use flyrig_types::{CameraId, ColorMatch, FrameSet, Rig};
 use glam::DVec2;
 use serde_json::json;
 
-use super::{FILES, refuse_existing};
+use super::output::{FILES, refuse_existing};
 use crate::{cli::CalibrateColorArgs, opening::open_take};
 
-/// Gaussians on a person: enough for colours, in a quarter of the time.
+/// Number of Gaussians per person: enough for colours, in a quarter of the time.
 const GAUSSIANS: usize = 30_000;
-/// Points that are taken of a person and a set.
+/// Number of points per person and frame set.
 const POINTS: usize = 2000;
-/// Sets from one whose colours are taken to the next.
+/// Frame sets from one whose colours are sampled to the next.
 const EVERY: u64 = 4;
-/// Weight of the angle (Eq. 7), and nearness to the drawn surface exp(-k d), that a point needs in a view.
+/// Least weight of the viewing angle (Eq. 7) and least proximity exp(-k d) to the rendered surface of a point in a view.
 const LEAST_WEIGHT: f32 = 0.1;
 const LEAST_NEARNESS: f32 = 0.85;
-/// A surface is looked at within a square that reaches this share of the image's width to each side.
+/// Image width over half the side of the square that a colour is averaged in.
 const REACH: u32 = 200;
-/// Range of sRGB values there, as a share of their mean, at which a sample counts half; and beyond which it is not used.
+/// Range of sRGB values in the square, relative to their mean, at which a sample's weight is halved, and beyond which it is 0.
 const EVEN: (f64, f64) = (0.05, 0.5);
-/// Differences between cameras that are not worth a correction.
+/// Largest relative difference between cameras that needs no correction.
 const MATCHED: f64 = 0.02;
-/// Gains of the halves of a take may differ by this share.
+/// Largest relative difference between the gains of the halves of a take.
 const MOST_HALVES: f64 = 0.03;
 
 /// Runs the command.
@@ -64,7 +64,7 @@ pub fn color(args: &CalibrateColorArgs, gpu: &dyn Fn() -> Result<GpuContext>) ->
     settings.body.gaussians = GAUSSIANS;
     settings.validate()?;
     let mut estimated = EstimatedPerception::new(&rig, &template, &settings.perception, &plates)?;
-    // Somebody who comes later is measured then.
+    // People who come later are measured then.
     if let Err(error) = estimated.learn_shapes(&first_sets(args, &rig, open()?)?) {
         tracing::debug!(%error, "nobody in the first sets");
     }
@@ -87,7 +87,7 @@ pub fn color(args: &CalibrateColorArgs, gpu: &dyn Fn() -> Result<GpuContext>) ->
     Ok(())
 }
 
-/// Returns sets of the first seconds, from which shapes are measured.
+/// Reads frame sets of the first seconds, from which shapes are estimated.
 fn first_sets(args: &CalibrateColorArgs, rig: &Rig, take: Take) -> Result<Vec<FrameSet>> {
     let secs = [args.from_secs, args.from_secs + SHAPE_SECS];
     let (mut sets, mut first): (Vec<FrameSet>, _) = (Vec::new(), None);
@@ -102,7 +102,7 @@ fn first_sets(args: &CalibrateColorArgs, rig: &Rig, take: Take) -> Result<Vec<Fr
     Ok(sets)
 }
 
-/// Follows people through the take and collects what cameras see of their surfaces.
+/// Tracks people through the take and samples the colours of their surfaces.
 fn look_through(args: &CalibrateColorArgs, rig: &Rig, session: &mut Session, take: Take) -> Result<Vec<ColorPoint>> {
     let secs = [args.from_secs, args.from_secs + args.secs];
     let (mut points, mut sets) = (Vec::new(), 0u64);
@@ -128,7 +128,7 @@ fn look_through(args: &CalibrateColorArgs, rig: &Rig, session: &mut Session, tak
     Ok(points)
 }
 
-/// Takes the points that two views or more see well.
+/// Samples the points that at least two views see well.
 fn seen(rig: &Rig, observed: &Observed, instant: u64) -> Vec<ColorPoint> {
     let views = &observed.observations.views;
     let count = observed.center_scale.len();
@@ -150,12 +150,12 @@ fn seen(rig: &Rig, observed: &Observed, instant: u64) -> Vec<ColorPoint> {
     };
     let all: Vec<ColorPoint> = (0..count).filter_map(point).collect();
     let step = all.len().div_ceil(POINTS).max(1);
-    // Others each time.
+    // Different points each time.
     all.into_iter().skip(instant as usize % step).step_by(step).collect()
 }
 
-/// Returns the mean sRGB values around a pixel of an image with the mask as alpha, and how much they count, 0 to 1: where the surface is
-/// patterned, a small error of its place is one of its colour. `None` at the mask's edge and outside.
+/// Returns the mean sRGB values around a pixel of an image with the mask as alpha, and their weight, 0 to 1: on a patterned surface,
+/// a small position error is a colour error. `None` at the mask's edge and outside.
 fn srgb_at([width, height]: [u32; 2], rgba: &[u8], [x, y]: [f32; 2]) -> Option<([f64; 3], f64)> {
     let reach = i64::from(width / REACH).max(1);
     let (x, y) = (x.round() as i64, y.round() as i64);
@@ -178,7 +178,7 @@ fn srgb_at([width, height]: [u32; 2], rgba: &[u8], [x, y]: [f32; 2]) -> Option<(
     let count = (2 * reach + 1).pow(2) as f64;
     let mean: [f64; 3] = sums.map(|sum| f64::from(sum) / (255.0 * count));
     let range = (0..3).map(|k| f64::from(most[k] - least[k]) / (255.0 * mean[k])).fold(0.0, f64::max);
-    // NaN, of black, is not below.
+    // Black gives NaN, which does not compare below.
     (range < EVEN.1).then(|| (mean, 1.0 / (1.0 + (range / EVEN.0).powi(2))))
 }
 

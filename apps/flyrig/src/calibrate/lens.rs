@@ -1,4 +1,4 @@
-//! `flyrig calibrate lens`: the lenses of cameras, each by itself.
+//! `flyrig calibrate lens`: calibrates the lens of each camera separately.
 
 use anyhow::{Context as _, Result};
 use flyrig_calib::{Board, LensFit, calibrate_lens, save_lenses};
@@ -6,10 +6,10 @@ use flyrig_gpu::GpuContext;
 use flyrig_report::stop;
 use flyrig_types::{CameraId, Intrinsics};
 
-use super::{refuse_existing, views::Seen};
+use super::{output::refuse_existing, views::Seen};
 use crate::cli::CalibrateLensArgs;
 
-/// Coverage below which edges of the image are guesses.
+/// Least coverage of an image, 0..=1: below it the lens is extrapolated at the edges.
 const GOOD_COVERAGE: f64 = 0.6;
 
 /// Runs the command.
@@ -26,7 +26,7 @@ pub fn lens(args: &CalibrateLensArgs, gpu: &dyn Fn() -> Result<GpuContext>) -> R
     Ok(())
 }
 
-/// Calibrates the lens of every camera and prints how well.
+/// Calibrates the lens of every camera and prints the residuals.
 pub fn solve(board: &Board, seen: &Seen) -> Result<Vec<(CameraId, Intrinsics)>> {
     let mut lenses = Vec::new();
     println!(
@@ -55,7 +55,7 @@ pub fn solve(board: &Board, seen: &Seen) -> Result<Vec<(CameraId, Intrinsics)>> 
     Ok(lenses)
 }
 
-/// The model, and the error of views that were kept out for each.
+/// Formats the lens model, and the error of each model on held-out views.
 fn model(fit: &LensFit) -> String {
     let errors: Vec<String> = fit.held_out_px.iter().map(|(model, px)| format!("{} {px:.3}", model.name())).collect();
     format!("{} (kept-out views, px: {})", fit.model.name(), errors.join(", "))

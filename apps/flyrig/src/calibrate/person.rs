@@ -1,4 +1,4 @@
-//! `flyrig calibrate person`: better poses and time offsets of cameras from one person who moves.
+//! `flyrig calibrate person`: refines poses and time offsets of cameras from one moving person.
 
 use anyhow::{Context as _, Result, ensure};
 use flyrig_body::{ShapeParams, default_template};
@@ -14,12 +14,12 @@ use flyrig_types::{Camera, Image, Rig};
 use glam::DVec2;
 use serde_json::json;
 
-use super::{FILES, refuse_existing};
+use super::output::{FILES, refuse_existing};
 use crate::{cli::CalibratePersonArgs, opening::open_take};
 
-/// Landmarks in use, by their index in the network: nose, eyes, ears, shoulders to wrists, index fingers, hips to toes.
+/// Indices of the landmarks in use in the network's output: nose, eyes, ears, shoulders to wrists, index fingers, hips to toes.
 const LANDMARKS: [usize; 23] = [0, 2, 5, 7, 8, 11, 12, 13, 14, 15, 16, 19, 20, 23, 24, 25, 26, 27, 28, 29, 30, 31, 32];
-/// Pairs of the network's landmarks at a constant distance.
+/// Pairs of landmarks at a constant distance.
 const LIMBS: [(usize, usize); 17] = [
     (7, 8),
     (0, 7),
@@ -42,17 +42,17 @@ const LIMBS: [(usize, usize); 17] = [
 /// Groups of (left, right) landmarks that the network confuses together: face, arms, legs.
 const MIRRORED: [&[(usize, usize)]; 3] =
     [&[(2, 5), (7, 8)], &[(11, 12), (13, 14), (15, 16), (19, 20)], &[(23, 24), (25, 26), (27, 28), (29, 30), (31, 32)]];
-/// Median reprojection error, as a fraction of the image's longer side, beyond which a camera shows somebody else.
+/// Median reprojection error, as a fraction of the image's longer side, beyond which a camera shows another person.
 const MOST_ERROR: f64 = 0.02;
-/// A camera was wrong if the person moves in its image by more than this, and by this multiple of the halves' difference.
+/// Displacement of the person in a camera's image beyond which its pose was wrong, pixels, and as a multiple of the halves' difference.
 const LEAST_MOVED_PX: f64 = 2.0;
 const CLEARLY: f64 = 2.0;
-/// Acceptable difference between the halves of a take, pixels.
+/// Largest acceptable difference between the halves of a take, pixels.
 const MOST_HALVES_PX: f64 = 4.0;
-/// Least offset worth reporting, and largest standard deviation of a useful one, seconds.
+/// Least reported time offset, and largest standard deviation of a useful one, seconds.
 const LEAST_LAG_S: f64 = 0.003;
 const MOST_LAG_SIGMA_S: f64 = 0.008;
-/// Confidence that a landmark needs.
+/// Least confidence of a landmark.
 const CONFIDENCE: f64 = 0.3;
 
 /// Runs the command.
@@ -91,7 +91,7 @@ pub fn person(args: &CalibratePersonArgs, gpu: &dyn Fn() -> Result<GpuContext>) 
     }
     print(&rig, &tracks, &fit);
     advise(&rig, &fit, options.lags);
-    // Total of the offset that was subtracted already and the residual one.
+    // The total of the already subtracted offset and the residual one.
     let mut better = fit.rig.clone();
     for (camera, solved) in better.cameras.iter_mut().zip(&fit.cameras) {
         let known = known_nanos.get(&camera.id).copied().unwrap_or_default();
@@ -193,7 +193,7 @@ fn print(rig: &Rig, tracks: &PersonTracks, fit: &PersonFit) {
     }
 }
 
-/// Prints which cameras were wrong, how to use the time offsets, and which movement is missing.
+/// Prints the cameras that were wrong, the use of the time offsets, and missing movements.
 fn advise(rig: &Rig, fit: &PersonFit, with_lags: bool) {
     let cameras = || rig.cameras.iter().map(|camera| &camera.id).zip(&fit.cameras);
     for (id, camera) in cameras() {

@@ -10,24 +10,29 @@ use flyrig_types::Intrinsics;
 use glam::DVec3;
 use serde_json::json;
 
-use super::{FILES, lens, page, refuse_existing, views::Seen};
+use super::{
+    lens,
+    output::{FILES, refuse_existing},
+    page,
+    views::Seen,
+};
 use crate::cli::CalibrateRigArgs;
 
 /// Name of the page about the calibration.
 pub(super) const PAGE: &str = "calibration.html";
-/// Time offsets are kept where they lower the noise to this share.
+/// Ratio of the noise with and without time offsets below which they are kept.
 const OFFSETS_PAY: f64 = 0.95;
-/// A bend is kept where it lowers the noise to this share, and is this many times its standard deviation.
+/// Ratio of the noise with and without a bent board below which the bend is kept, and its least multiple of the standard deviation.
 const BEND_PAYS: f64 = 0.95;
 const BEND_SIGMAS: f64 = 5.0;
-/// A take with `--floor` shows the board within so many seconds.
+/// Time within which a take with `--floor` must show the board, seconds.
 const FLOOR_WITHIN_SECS: f64 = 2.0;
-/// Cameras look down on a floor by less than this, degrees.
+/// Largest angle between cameras and a floor that they look down on, degrees.
 const MOST_TILT_DEG: f64 = 70.0;
-/// Halves of the shots may differ by so many times what noise explains.
+/// Largest difference between the halves of the shots, as a multiple of the noise.
 const MOST_DISAGREEMENT: f64 = 1.5;
 
-/// Where results go, and how the rig is solved.
+/// Destination of the results, and options of the solve.
 pub(super) struct Target<'a> {
     pub out: &'a Path,
     pub floor: bool,
@@ -75,7 +80,7 @@ pub(super) fn solve_and_write(
         calibrate_rig(board, &seen.ids, lenses, &seen.shots, options)
     };
     let plain = solve(false, false)?;
-    // Offsets only where the board moved, and where they explain something.
+    // Offsets are kept only if the board moved and they lower the noise.
     let with_offsets = if args.no_offsets { None } else { solve(true, false).ok() };
     let better = |fit: &RigFit| {
         fit.sigma_px < OFFSETS_PAY * plain.sigma_px && fit.cameras.iter().all(|camera| camera.deviation.is_some())
@@ -126,7 +131,7 @@ pub(super) fn solve_and_write(
     Ok(())
 }
 
-/// The lenses of a folder, or as calibrated from this take.
+/// Loads the lenses of a folder, or calibrates them from this take.
 pub(super) fn lenses(folder: Option<&Path>, board: &Board, seen: &Seen) -> Result<Vec<Intrinsics>> {
     let Some(folder) = folder else {
         return Ok(lens::solve(board, seen)?.into_iter().map(|(_, intrinsics)| intrinsics).collect());
@@ -174,7 +179,7 @@ fn print(seen: &Seen, fit: &RigFit, has_offsets: bool) {
     }
 }
 
-/// Returns the results of the solve as sentences, for the terminal and the page.
+/// Formats the results of the solve as sentences, for the terminal and the page.
 fn sentences(seen: &Seen, fit: &RigFit, noise_without_offsets: Option<f64>) -> Vec<String> {
     let mut lines = vec![format!(
         "rms {:.3} px, noise {:.3} px a coordinate, {} boards",

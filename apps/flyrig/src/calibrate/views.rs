@@ -18,10 +18,10 @@ use rayon::prelude::*;
 
 use crate::{cli::TakeArgs, opening::open_take};
 
-/// Images that are looked at together.
+/// Number of images that are searched in parallel.
 const BATCH: usize = 16;
 
-/// Seconds that live cameras may take until their first frame.
+/// Time that live cameras have for their first frame, seconds.
 const PATIENCE_SECS: f64 = 15.0;
 
 /// Opens the frames of a take. `gpu` opens a graphics adapter, for simulated cameras alone.
@@ -33,18 +33,18 @@ pub fn open_frames(args: &TakeArgs, gpu: &dyn Fn() -> Result<GpuContext>) -> Res
 /// Boards that were seen in a take.
 pub struct Seen {
     pub ids: Vec<CameraId>,
-    /// By camera, pixels; `None` for one without an image.
+    /// Width and height of each camera's images, pixels; `None` without an image.
     pub sizes: Vec<Option<[u32; 2]>>,
-    /// Sets in which at least one camera saw the board.
+    /// Frame sets in which at least one camera saw the board.
     pub shots: Vec<BoardShot>,
-    /// By camera: images that were looked at.
+    /// Number of searched images per camera.
     pub images: Vec<usize>,
-    /// Time of the first set, nanoseconds.
+    /// Time of the first frame set, nanoseconds.
     pub begin_nanos: i64,
 }
 
 impl Seen {
-    /// Opens a take and looks for the board; every camera must see it. `gpu` opens a graphics adapter, for simulated cameras alone.
+    /// Opens a take and detects the board, which every camera must see. `gpu` opens a graphics adapter, for simulated cameras alone.
     pub fn find(args: &TakeArgs, board: &Board, gpu: &dyn Fn() -> Result<GpuContext>) -> Result<Self> {
         let bar = progress_bar((args.secs * 1e3) as u64, "boards, ms of the take");
         let seen = Self::look_through(open_frames(args, gpu)?, board, args, |seen, at| {
@@ -57,7 +57,7 @@ impl Seen {
         Ok(seen)
     }
 
-    /// Looks for the board in a take until it ends; `each` is called with what was seen so far and the seconds of the take, and may end it.
+    /// Detects the board in a take until its end. `each` gets the results so far and the seconds since the first frame set, and may break.
     pub fn look_through(
         take: Take,
         board: &Board,
@@ -89,7 +89,7 @@ impl Seen {
             if at > secs {
                 break;
             }
-            // A little early is the right set where stamps jitter.
+            // Jitter may bring the right frame set slightly early.
             if set.master_nanos < next {
                 continue;
             }
@@ -152,12 +152,12 @@ impl Seen {
         Ok(())
     }
 
-    /// Views of one camera, in the order of time.
+    /// Returns the views of one camera in the order of time.
     pub fn of_camera(&self, slot: usize) -> Vec<BoardView> {
         self.shots.iter().flat_map(|shot| &shot.views).filter(|view| view.camera == slot).cloned().collect()
     }
 
-    /// Checks that every camera saw the board at all.
+    /// Checks that every camera saw the board.
     pub fn check(&self, board: &Board) -> Result<()> {
         for (slot, id) in self.ids.iter().enumerate() {
             ensure!(

@@ -15,7 +15,6 @@ use flyrig_monitor::{Monitor, effort, ended_by_itself};
 use flyrig_report::stop;
 use signal_hook::consts::SIGUSR1;
 
-use super::RigRun;
 use crate::{config::Config, recording::RigRecording};
 
 /// Longest wait of a step for a frame set before health and Ctrl-C are checked.
@@ -41,19 +40,25 @@ pub(super) struct LiveRun<'a> {
 
 impl<'a> LiveRun<'a> {
     /// Starts the run of a rig and listens for SIGUSR1.
-    pub fn new(run: &RigRun<'a>, rig: LiveRig, recording: Option<RigRecording>) -> Result<Self> {
+    pub fn new(
+        config: &'a Config,
+        rig: LiveRig,
+        recorder: Option<&'a Recorder>,
+        recording: Option<RigRecording>,
+        prints_rates: bool,
+    ) -> Result<Self> {
         let started = Instant::now();
         let measure = Arc::new(AtomicBool::new(false));
         signal_hook::flag::register(SIGUSR1, Arc::clone(&measure)).context("cannot listen for SIGUSR1")?;
         Ok(Self {
-            config: run.config,
+            config,
             rig,
-            recorder: run.recorder,
+            recorder,
             recording,
             measure,
             started,
             saved: started,
-            printed: (!run.show_table).then_some((started, 0)),
+            printed: prints_rates.then_some((started, 0)),
         })
     }
 
