@@ -86,7 +86,7 @@ pub fn capture(config: &Config, key: Option<&Path>, gpu: Option<&GpuContext>) ->
             let line: Vec<String> = counts
                 .iter()
                 .map(|(camera, counts)| {
-                    let watched = if counts.watched { "" } else { ", nobody listens" };
+                    let watched = if counts.watched { "" } else { ", not received" };
                     format!("{camera}: {} sent, {} overtaken{watched}", counts.sent, counts.replaced)
                 })
                 .collect();

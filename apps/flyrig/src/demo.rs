@@ -392,7 +392,7 @@ fn summary(metrics: &Metrics) -> Vec<(String, String)> {
         (
             "end to end".to_owned(),
             format!(
-                "{} frames, {:.2} a second without scoring (simulating the three input cameras included)",
+                "{} frames, {:.2} per second without scoring (simulating the three input cameras included)",
                 metrics.frames, metrics.frames_per_second
             ),
         ),

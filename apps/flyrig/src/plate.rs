@@ -38,7 +38,7 @@ pub fn plate(args: &PlateArgs, gpu: &dyn Fn() -> Result<GpuContext>) -> Result<(
         bail!("{} is there already; --force replaces it", known.display());
     }
     if pacing == Pacing::AsDelivered {
-        eprintln!("recording the empty scene for {} s: nobody may be in the images", args.secs);
+        eprintln!("recording the empty scene for {} s: no person may be in the images", args.secs);
     }
     let scenes = record(args.secs, sources, pacing, &cameras)?;
     let net = PoseNet::embedded()?;
@@ -47,7 +47,7 @@ pub fn plate(args: &PlateArgs, gpu: &dyn Fn() -> Result<GpuContext>) -> Result<(
         let plate = scene.plate()?;
         if !args.force && shows_person(&net, &plate.image)? {
             bail!(
-                "camera {}: somebody stands in the image; leave the scene empty and try again, or accept it with --force",
+                "camera {}: a person stands in the image; leave the scene empty and try again, or accept it with --force",
                 scene.camera
             );
         }

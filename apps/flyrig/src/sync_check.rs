@@ -25,13 +25,13 @@ pub fn sync_check(args: &SyncCheckArgs, gpu: &dyn Fn() -> Result<GpuContext>) ->
     let cameras: Vec<CameraId> = take.sources.iter().map(|source| source.camera().clone()).collect();
     ensure!(cameras.len() > 1, "a time offset needs at least two cameras; name another one");
     let advice = if take.is_live { ADD_TO_CAMERA } else { ADD };
-    let (estimates, frames, told, mend) = match take.calibration.take() {
+    let (estimates, frames, legend, advice_if_missing) = match take.calibration.take() {
         Some(Calibration { rig, plates }) if !take.is_live => {
             let (estimates, frames) = by_silhouettes(args, &rig, plates, take)?;
-            let told = "by silhouettes; +- is the standard error, fit how much better the lag fits than others";
-            let mend = "the estimate is less certain than 5 ms: let one person whom all cameras see whole jump, squat and wave \
+            let legend = "by silhouettes; +- is the standard error, fit how much better the lag fits than others";
+            let advice_if_missing = "the estimate is less certain than 5 ms: let one person whom all cameras see whole jump, squat and wave \
                         above the head, for eight seconds";
-            (estimates, frames, told, mend)
+            (estimates, frames, legend, advice_if_missing)
         }
         _ => {
             ensure!(
@@ -43,17 +43,17 @@ pub fn sync_check(args: &SyncCheckArgs, gpu: &dyn Fn() -> Result<GpuContext>) ->
                 eprintln!("sync-check: jump and wave both arms before all cameras for {} s, please", args.seconds);
             }
             let (estimates, frames) = by_motion(args, take.sources, &cameras, &take.sync, take.is_live)?;
-            let mend = "its motion does not correlate with that of other cameras, is too slow, or too short (under five seconds): jump and wave both \
+            let advice_if_missing = "its motion does not correlate with that of other cameras, is too slow, or too short (under five seconds): jump and wave both \
                         arms before all cameras; surer, with a calibration: flyrig record, and sync-check of the recording";
-            let told = "from motion; +- is the disagreement between camera pairs, fit the best correlation with another camera";
-            (estimates, frames, told, mend)
+            let legend = "from motion; +- is the disagreement between camera pairs, fit the best correlation with another camera";
+            (estimates, frames, legend, advice_if_missing)
         }
     };
     print(&estimates, &frames);
-    println!("{told}");
+    println!("{legend}");
     if estimates.iter().any(|estimate| estimate.lag_nanos.is_none()) {
         println!(
-            "?: {mend}. Or the offset is larger than --most-ms {}, or the clocks drift: compare --seconds 5 of an early and a late part \
+            "?: {advice_if_missing}. Or the offset is larger than --most-ms {}, or the clocks drift: compare --seconds 5 of an early and a late part \
              (--from-secs)",
             args.most_ms
         );
@@ -248,7 +248,7 @@ mod tests {
 
     #[test]
     #[ignore = "minutes: run by make test-long"]
-    fn lags_by_motion_are_right_or_not_told() {
+    fn lags_by_motion_are_right_or_not_reported() {
         let gpu = GpuContext::new(&AdapterChoice::Best).unwrap();
         // Slow movements look different from every side: no estimate is better than a wrong one.
         let waving = (2..6).map(|seed| (MotionKind::Wave, seed));
@@ -262,7 +262,7 @@ mod tests {
 
     #[test]
     #[ignore = "minutes: run by make test-long"]
-    fn lags_by_silhouettes_are_right_within_their_error_or_not_told() {
+    fn lags_by_silhouettes_are_right_within_their_error_or_not_reported() {
         let gpu = GpuContext::new(&AdapterChoice::Best).unwrap();
         use MotionKind::{CrossArms, Dance, Jump, Squat, Turn, Walk, Wave};
         let all = [(Jump, 11), (Jump, 12), (Squat, 13), (Dance, 14)];
@@ -271,7 +271,7 @@ mod tests {
             println!("{kind:?} {seed}");
             for (off, error) in Lagging::new(&gpu, seed, kind, 256, 240).by_silhouettes() {
                 let is_all = all.contains(&(kind, seed));
-                assert!(off.is_some() || !is_all, "{kind:?} {seed}: not told, standard error {error} ms");
+                assert!(off.is_some() || !is_all, "{kind:?} {seed}: not reported, standard error {error} ms");
                 let bound = if is_all { 2.0 } else { 2.0f64.max(3.0 * error) };
                 assert!(off.is_none_or(|off| off.abs() <= bound), "{kind:?} {seed}: off by {off:?} of {bound} ms");
             }

@@ -133,7 +133,7 @@ pub fn watch(args: &WatchArgs) -> Result<()> {
     }
     let stats = stats(&subscriber, received, first.map_or(0.0, |first| first.elapsed().as_secs_f64()));
     eprintln!(
-        "watch: {received} images, {} missed, {} replaced unseen, {:.1} a second",
+        "watch: {received} images, {} missed, {} replaced unseen, {:.1} per second",
         stats.missed, stats.replaced, stats.images_per_second
     );
     if let Some(path) = &args.stats {

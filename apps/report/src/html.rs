@@ -10,6 +10,23 @@ use flyrig_metrics::CameraScore;
 use crate::plot::{Line, Plot, Series};
 
 /// Contents of a report; empty parts are left out.
+///
+/// ```
+/// use flyrig_report::{Curve, Report};
+///
+/// let report = Report {
+///     title: "Memory".to_owned(),
+///     facts: vec![("adapter".to_owned(), "software".to_owned())],
+///     curves: vec![Curve {
+///         title: "Resident memory".to_owned(),
+///         x_label: "seconds".to_owned(),
+///         y_label: "MiB".to_owned(),
+///         lines: vec![("flyrig run".to_owned(), vec![(0.0, 310.0), (60.0, 312.5)])],
+///     }],
+///     ..Report::default()
+/// };
+/// assert!(report.html().contains("<h1>Memory</h1>"));
+/// ```
 #[derive(Debug, Default)]
 pub struct Report {
     /// Heading of the page.
@@ -86,6 +103,22 @@ impl Report {
         if let Some(secs) = self.refresh_secs {
             let _ = write!(page, "<meta http-equiv=refresh content={secs}>");
         }
+        self.write_texts(&mut page);
+        for (title, svg) in &self.drawings {
+            let _ = write!(page, "<h2>{}</h2>{svg}", escape(title));
+        }
+        self.write_scores(&mut page);
+        self.write_contact(&mut page);
+        self.write_stages(&mut page);
+        for curve in &self.curves {
+            let _ = write!(page, "<h2>{}</h2>{}", escape(&curve.title), curve.svg());
+        }
+        page.push_str("</html>\n");
+        page
+    }
+
+    /// Writes sentences, facts and tables.
+    fn write_texts(&self, page: &mut String) {
         for sentence in &self.sentences {
             let _ = write!(page, "<p>{}", escape(sentence));
         }
@@ -103,9 +136,9 @@ impl Report {
             let rows: String = rows.iter().map(|row| format!("<tr>{}", cells("td", row))).collect();
             let _ = write!(page, "<h2>{}</h2><table><tr>{}{rows}</table>", escape(title), cells("th", head));
         }
-        for (title, svg) in &self.drawings {
-            let _ = write!(page, "<h2>{}</h2>{svg}", escape(title));
-        }
+    }
+
+    fn write_scores(&self, page: &mut String) {
         for (name, scores) in &self.scores {
             let _ = write!(
                 page,
@@ -126,6 +159,9 @@ impl Report {
             }
             page.push_str("</table>");
         }
+    }
+
+    fn write_contact(&self, page: &mut String) {
         if !self.contact.is_empty() {
             page.push_str("<h2>Images</h2>");
         }
@@ -141,29 +177,28 @@ impl Report {
             }
             page.push_str("</div>");
         }
-        if !self.stages.is_empty() {
-            page.push_str(
-                "<h2>Time per stage</h2><table><tr><th>stage<th>frames<th>mean ms<th>median ms<th>95 % ms<th>99 % ms",
+    }
+
+    fn write_stages(&self, page: &mut String) {
+        if self.stages.is_empty() {
+            return;
+        }
+        page.push_str(
+            "<h2>Time per stage</h2><table><tr><th>stage<th>frames<th>mean ms<th>median ms<th>95 % ms<th>99 % ms",
+        );
+        for s in &self.stages {
+            let _ = write!(
+                page,
+                "<tr><td>{}<td>{}<td>{:.2}<td>{:.2}<td>{:.2}<td>{:.2}",
+                escape(&s.name),
+                s.frames,
+                s.mean_ms,
+                s.p50_ms,
+                s.p95_ms,
+                s.p99_ms
             );
-            for s in &self.stages {
-                let _ = write!(
-                    page,
-                    "<tr><td>{}<td>{}<td>{:.2}<td>{:.2}<td>{:.2}<td>{:.2}",
-                    escape(&s.name),
-                    s.frames,
-                    s.mean_ms,
-                    s.p50_ms,
-                    s.p95_ms,
-                    s.p99_ms
-                );
-            }
-            page.push_str("</table>");
         }
-        for curve in &self.curves {
-            let _ = write!(page, "<h2>{}</h2>{}", escape(&curve.title), curve.svg());
-        }
-        page.push_str("</html>\n");
-        page
+        page.push_str("</table>");
     }
 
     /// Writes the page, whole or not at all.

@@ -60,6 +60,21 @@ pub enum Line {
 }
 
 /// Diagram.
+///
+/// ```
+/// use flyrig_report::plot::{Line, Plot, Series};
+///
+/// let points = vec![(1.0, 30.2, "fast".to_owned()), (8.0, 33.7, "slow".to_owned())];
+/// let plot = Plot {
+///     title: "Run time against quality".to_owned(),
+///     x_label: "ms per frame".to_owned(),
+///     y_label: "PSNR, dB".to_owned(),
+///     log_x: true,
+///     log_y: false,
+///     series: vec![Series { name: "direct appearance".to_owned(), points, line: Line::Front }],
+/// };
+/// assert!(plot.svg().starts_with("<svg"));
+/// ```
 pub struct Plot {
     /// Heading.
     pub title: String,

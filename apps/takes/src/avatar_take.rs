@@ -61,7 +61,7 @@ impl AvatarTake {
         bar.finish_and_clear();
         let subject = replay.session.subject(person);
         let (Some(subject), Some(first), Some(last)) = (subject, numbers.first(), numbers.last()) else {
-            bail!("nobody was found in the take; run with -v to see why");
+            bail!("no person was found in the take; run with -v to see why");
         };
         let (surface, graph) = person_surface(subject.template(), body)?;
         let deforms = frames.iter().any(|frame| !frame.translations.is_empty());

@@ -26,7 +26,7 @@ pub fn gather(
     seed: u64,
 ) -> Result<TrainingSample> {
     let person = PersonId::default();
-    let subject = session.subject(person).context("nobody was simulated")?;
+    let subject = session.subject(person).context("no person was simulated")?;
     let Observed { observations, pictures, center_scale, normal, .. } = session.observed(person)?;
     let pictures: Vec<ViewImage<'_>> =
         pictures.iter().map(|(width, height, rgba)| ViewImage { width: *width, height: *height, rgba }).collect();

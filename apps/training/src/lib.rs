@@ -28,6 +28,8 @@ use self::{
 
 /// Offset of the seed of the test people, who only measure progress.
 const HELD_OUT_SEED: u64 = 1 << 40;
+/// File of the checkpoint.
+const CHECKPOINT: &str = "checkpoint.safetensors";
 /// Steps between two checkpoints.
 const CHECKPOINT_STEPS: u64 = 250;
 
@@ -59,7 +61,26 @@ pub fn train(args: &TrainArgs, gpu: &dyn Fn() -> Result<GpuContext>) -> Result<(
     }
     ensure!(!samples.is_empty(), "there is nothing to train on; ask for at least one person or data set");
 
-    let checkpoint = args.out.join("checkpoint.safetensors");
+    let mut trainer = begin_or_resume(args, begin)?;
+    trainer.device = device;
+    let mut progress = Progress::open(&args.out, trainer.step)?;
+    let card = Card { args, people: &people, samples: samples.len(), started };
+    train_until_end(&card, &mut trainer, &mut progress, &samples, &test)?;
+    println!("{} of {} steps; {}", trainer.step, args.steps, progress.message());
+    match progress.scores.last() {
+        Some(scores) => println!("{scores}"),
+        None => println!(
+            "that is of the samples it learned from; measure with `flyrig eval --weights` on a camera that took no part, since \
+             a short take is easily learned by heart"
+        ),
+    }
+    println!("weights.safetensors, weights.json, loss.csv, loss.svg in {}", args.out.display());
+    Ok(())
+}
+
+/// Resumes the training of the folder's checkpoint, or begins one.
+fn begin_or_resume(args: &TrainArgs, begin: Parameters) -> Result<Trainer> {
+    let checkpoint = args.out.join(CHECKPOINT);
     let settings = TrainSettings {
         seed: args.seed,
         steps: args.steps,
@@ -68,24 +89,32 @@ pub fn train(args: &TrainArgs, gpu: &dyn Fn() -> Result<GpuContext>) -> Result<(
         contrast: args.contrast,
         ..TrainSettings::default()
     };
-    let mut trainer = if checkpoint.exists() {
-        let trainer = Trainer::load(&checkpoint)?;
-        ensure!(
-            trainer.settings == settings && trainer.parameters.size == begin.size,
-            "{} was begun with other settings ({:?}, {:?}); give the same ones, or another --out",
-            checkpoint.display(),
-            trainer.parameters.size,
-            trainer.settings
-        );
-        if args.from.is_some() {
-            eprintln!("train: going on with {}; --from is for a training that begins", checkpoint.display());
-        }
-        trainer
-    } else {
-        Trainer::new(begin, settings)
-    };
-    trainer.device = device;
-    let mut progress = Progress::open(&args.out, trainer.step)?;
+    if !checkpoint.exists() {
+        return Ok(Trainer::new(begin, settings));
+    }
+    let trainer = Trainer::load(&checkpoint)?;
+    ensure!(
+        trainer.settings == settings && trainer.parameters.size == begin.size,
+        "{} was begun with other settings ({:?}, {:?}); give the same ones, or another --out",
+        checkpoint.display(),
+        trainer.parameters.size,
+        trainer.settings
+    );
+    if args.from.is_some() {
+        eprintln!("train: going on with {}; --from is for a training that begins", checkpoint.display());
+    }
+    Ok(trainer)
+}
+
+/// Trains until the last step or Ctrl-C, and writes checkpoints.
+fn train_until_end(
+    card: &Card<'_>,
+    trainer: &mut Trainer,
+    progress: &mut Progress,
+    samples: &[TrainingSample],
+    test: &[TrainingSample],
+) -> Result<()> {
+    let args = card.args;
     let bar = progress_bar(args.steps, "train");
     bar.set_position(trainer.step);
     bar.reset_eta();
@@ -98,24 +127,15 @@ pub fn train(args: &TrainArgs, gpu: &dyn Fn() -> Result<GpuContext>) -> Result<(
         bar.inc(1);
         if trainer.step % CHECKPOINT_STEPS == 0 || trainer.step == args.steps {
             if trainer.step % (CHECKPOINT_STEPS * args.test_every) == 0 || trainer.step == args.steps {
-                progress.scores.extend(score(&trainer, &test));
+                progress.scores.extend(score(trainer, test));
             }
             progress.save(&args.out)?;
             // Last: the files that belong to the checkpoint have been written.
-            trainer.save(&checkpoint)?;
-            save_weights(args, &trainer, &progress, &people, samples.len(), started)?;
+            trainer.save(&args.out.join(CHECKPOINT))?;
+            card.save_weights(trainer, progress)?;
         }
     }
     bar.finish_and_clear();
-    println!("{} of {} steps; {}", trainer.step, args.steps, progress.message());
-    match progress.scores.last() {
-        Some(scores) => println!("{scores}"),
-        None => println!(
-            "that is of the samples it learned from; measure with `flyrig eval --weights` on a camera that took no part, since \
-             a short take is easily learned by heart"
-        ),
-    }
-    println!("weights.safetensors, weights.json, loss.csv, loss.svg in {}", args.out.display());
     Ok(())
 }
 
@@ -187,30 +207,35 @@ fn read_extra(folders: &[PathBuf]) -> Result<Vec<TrainingSample>> {
     Ok(samples)
 }
 
-fn save_weights(
-    args: &TrainArgs,
-    trainer: &Trainer,
-    progress: &Progress,
-    people: &People,
+/// Facts of a training that its weights are saved with.
+struct Card<'a> {
+    args: &'a TrainArgs,
+    people: &'a People,
+    /// Number of training samples.
     samples: usize,
     started: Instant,
-) -> Result<()> {
-    let card = serde_json::json!({
-        "flyrig": env!("CARGO_PKG_VERSION"),
-        "command": command_line(),
-        "size": trainer.parameters.size,
-        "parameters": trainer.parameters.count(),
-        "settings": trainer.settings,
-        "step": trainer.step,
-        "people": { "train": people, "count": args.people, "held_out_seed": people.seed.wrapping_add(HELD_OUT_SEED) },
-        "samples": samples,
-        "scores": progress.scores,
-        "seconds_of_this_run": started.elapsed().as_secs(),
-        "machine": format!("{} threads", rayon::current_num_threads()),
-    });
-    trainer.parameters.save(&args.out.join("weights.safetensors"), &card)?;
-    let json = serde_json::to_vec_pretty(&card)?;
-    write_whole(&args.out.join("weights.json"), &json)
+}
+
+impl Card<'_> {
+    fn save_weights(&self, trainer: &Trainer, progress: &Progress) -> Result<()> {
+        let Self { args, people, samples, started } = self;
+        let card = serde_json::json!({
+            "flyrig": env!("CARGO_PKG_VERSION"),
+            "command": command_line(),
+            "size": trainer.parameters.size,
+            "parameters": trainer.parameters.count(),
+            "settings": trainer.settings,
+            "step": trainer.step,
+            "people": { "train": people, "count": args.people, "held_out_seed": people.seed.wrapping_add(HELD_OUT_SEED) },
+            "samples": samples,
+            "scores": progress.scores,
+            "seconds_of_this_run": started.elapsed().as_secs(),
+            "machine": format!("{} threads", rayon::current_num_threads()),
+        });
+        trainer.parameters.save(&args.out.join("weights.safetensors"), &card)?;
+        let json = serde_json::to_vec_pretty(&card)?;
+        write_whole(&args.out.join("weights.json"), &json)
+    }
 }
 
 /// Returns the command line, with paths shortened to their last part.

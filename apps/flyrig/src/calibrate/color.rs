@@ -45,7 +45,7 @@ pub fn color(args: &CalibrateColorArgs, gpu: &dyn Fn() -> Result<GpuContext>) ->
     let mut take = open()?;
     ensure!(
         !take.is_live,
-        "live cameras cannot be looked at frame by frame; record them first (flyrig record) and give the recording"
+        "live cameras cannot be processed frame by frame; record them first (flyrig record) and give the recording"
     );
     let Calibration { mut rig, plates } = take
         .calibration
@@ -66,12 +66,12 @@ pub fn color(args: &CalibrateColorArgs, gpu: &dyn Fn() -> Result<GpuContext>) ->
     let mut estimated = EstimatedPerception::new(&rig, &template, &settings.perception, &plates)?;
     // People who come later are measured then.
     if let Err(error) = estimated.learn_shapes(&first_sets(args, &rig, open()?)?) {
-        tracing::debug!(%error, "nobody in the first sets");
+        tracing::debug!(%error, "no person in the first frame sets");
     }
     let mut session = SessionBuilder::new(gpu()?, rig.clone()).settings(settings).perception(estimated).build()?;
     session.keep_observations()?;
     let points = look_through(args, &rig, &mut session, take)?;
-    ensure!(!points.is_empty(), "nobody is followed; let one person walk where all cameras see them whole");
+    ensure!(!points.is_empty(), "no person is tracked; let one person walk where all cameras see them whole");
     let ids: Vec<CameraId> = rig.cameras.iter().map(|camera| camera.id.clone()).collect();
     let fit = match_colors(&ids, &points)?;
     for (camera, solved) in rig.cameras.iter_mut().zip(&fit.cameras) {

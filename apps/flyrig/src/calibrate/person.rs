@@ -64,7 +64,7 @@ pub fn person(args: &CalibratePersonArgs, gpu: &dyn Fn() -> Result<GpuContext>) 
     let mut take = open_take(&args.input, &options, gpu)?;
     ensure!(
         !take.is_live,
-        "live cameras cannot be looked at frame by frame; record them first (flyrig record) and give the recording"
+        "live cameras cannot be processed frame by frame; record them first (flyrig record) and give the recording"
     );
     let Calibration { rig, plates } = take
         .calibration
@@ -146,7 +146,7 @@ fn look_through(args: &CalibratePersonArgs, rig: &Rig, plates: Vec<Option<Image>
         }
         ensure!(
             tracks.images(slot) > 0,
-            "camera {}: nobody is seen; let one person move where all cameras see them whole",
+            "camera {}: no person is seen; let one person move where all cameras see them whole",
             camera.id
         );
     }

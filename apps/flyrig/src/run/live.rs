@@ -98,7 +98,7 @@ impl<'a> LiveRun<'a> {
         saved?;
         ensure!(
             seen || frames == 0 || stop::requested(),
-            "nobody was seen in {frames} sets: check that people stand in view of two cameras, and the calibration"
+            "no person was seen in {frames} frame sets: check that people stand in view of two cameras, and the calibration"
         );
         // A recording ends; live cameras do not.
         if self.config.source.kind.is_live() && !stop::requested() {
@@ -112,7 +112,7 @@ impl<'a> LiveRun<'a> {
             eprintln!("run: SIGUSR1, everybody is measured again");
         } else {
             eprintln!(
-                "run: SIGUSR1, but nobody is measured: perception.shape is \"given\", or there is only one camera"
+                "run: SIGUSR1, but no person is measured: perception.shape is \"given\", or there is only one camera"
             );
         }
     }
