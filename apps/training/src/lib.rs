@@ -125,8 +125,9 @@ fn train_until_end(
             bar.set_message(progress.message());
         }
         bar.inc(1);
-        if trainer.step % CHECKPOINT_STEPS == 0 || trainer.step == args.steps {
-            if trainer.step % (CHECKPOINT_STEPS * args.test_every) == 0 || trainer.step == args.steps {
+        let is_last = trainer.step == args.steps;
+        if is_last || trainer.step.is_multiple_of(CHECKPOINT_STEPS) {
+            if is_last || trainer.step.is_multiple_of(CHECKPOINT_STEPS * args.test_every) {
                 progress.scores.extend(score(trainer, test));
             }
             progress.save(&args.out)?;
