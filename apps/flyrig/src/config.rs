@@ -1,6 +1,6 @@
 //! The configuration file: one commented default, strict reading, errors that name line and key.
 
-use std::path::{Path, PathBuf};
+use std::path::Path;
 
 use anyhow::{Context, Result, bail, ensure};
 use flyrig_capture::Rotation;
