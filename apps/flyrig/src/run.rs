@@ -16,7 +16,7 @@ use flyrig_transport::{Publisher, TransportConfig};
 use flyrig_types::Image;
 use flyrig_web::WebServer;
 
-use self::{known::Known, live::LiveRun};
+use self::{known::PriorKnowledge, live::LiveRun};
 use crate::{
     config::{Config, WatchMode},
     opening::open_cameras,
@@ -61,7 +61,7 @@ impl RigRun<'_> {
         let intake = self.start_intake(&mut take, calibration)?;
         Monitor::ready();
         let body = take.body.take().context("the take has no body")?;
-        let known = Known::load(config, &body.template)?;
+        let known = PriorKnowledge::load(config, &body.template)?;
         let watch = rig_watch(config.calibration.watch, calibration)?;
         let builder = SessionBuilder::new(self.gpu.clone(), calibration.rig.clone()).settings(config.session());
         let builder = known.add_to(builder, config, calibration, body)?;

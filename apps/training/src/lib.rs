@@ -22,7 +22,7 @@ use flyrig_stfa::{NetworkDevice, Parameters, SampleErrors, TrainSettings, Traine
 
 pub use self::arguments::{SizeName, TrainArgs};
 use self::{
-    people::People,
+    people::TrainingPeople,
     report::{Progress, Scores},
 };
 
@@ -47,8 +47,9 @@ pub fn train(args: &TrainArgs, gpu: &dyn Fn() -> Result<GpuContext>) -> Result<(
         NetworksOn::Adapter => NetworkDevice::adapter(&gpu()?)?,
     };
     std::fs::create_dir_all(&args.out).with_context(|| format!("cannot create {}", args.out.display()))?;
-    let people = People { seed: args.seed, instants: args.instants, side: args.side, gaussians: args.gaussians };
-    let held_out = People { seed: args.seed.wrapping_add(HELD_OUT_SEED), ..people.clone() };
+    let people =
+        TrainingPeople { seed: args.seed, instants: args.instants, side: args.side, gaussians: args.gaussians };
+    let held_out = TrainingPeople { seed: args.seed.wrapping_add(HELD_OUT_SEED), ..people.clone() };
     let mut samples = simulated(args, &people, args.people, "samples", gpu)?;
     let mut folders = args.extra.clone();
     for dataset in &args.dataset {
@@ -158,7 +159,7 @@ fn score(trainer: &Trainer, test: &[TrainingSample]) -> Option<Scores> {
 /// Returns samples of simulated people; simulates those that the folder lacks.
 fn simulated(
     args: &TrainArgs,
-    people: &People,
+    people: &TrainingPeople,
     count: u64,
     folder: &str,
     gpu: &dyn Fn() -> Result<GpuContext>,
@@ -211,7 +212,7 @@ fn read_extra(folders: &[PathBuf]) -> Result<Vec<TrainingSample>> {
 /// Facts of a training that its weights are saved with.
 struct Card<'a> {
     args: &'a TrainArgs,
-    people: &'a People,
+    people: &'a TrainingPeople,
     /// Number of training samples.
     samples: usize,
     started: Instant,

@@ -30,7 +30,7 @@ const SPAN_FRAMES: u64 = 1800;
 
 /// Simulated people to train on.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
-pub struct People {
+pub struct TrainingPeople {
     /// Seed of all people.
     pub seed: u64,
     /// Number of instants of each person, each with its own cameras, lens and pose.
@@ -41,7 +41,7 @@ pub struct People {
     pub gaussians: usize,
 }
 
-impl People {
+impl TrainingPeople {
     /// Returns the capture of one person, with random body, motion, room, lights, lenses and calibration errors.
     ///
     /// Effects that mainly cost time are left out: apertures and rolling shutters (which render the room several times), and most

@@ -21,7 +21,7 @@ const PARTS: [[&str; 3]; 3] = [
 ];
 
 /// State of a calibration under way.
-pub struct Progress<'a> {
+pub struct CalibrationState<'a> {
     pub ids: &'a [CameraId],
     /// Width and height of each camera's images, pixels; `None` without an image.
     pub sizes: &'a [Option<[u32; 2]>],
@@ -60,7 +60,7 @@ pub enum Step {
     Done(f64),
 }
 
-impl Progress<'_> {
+impl CalibrationState<'_> {
     /// Returns the first missing step.
     pub fn next(&self) -> Step {
         let slots = || 0..self.ids.len();
@@ -284,7 +284,7 @@ mod tests {
         solved: Option<&Result<RigFit, CalibError>>,
     ) -> (Step, String) {
         let ids = ids(sizes.len());
-        let progress = Progress { ids: &ids, sizes, shots, with_lenses: true, solved, target_mm: 2.0 };
+        let progress = CalibrationState { ids: &ids, sizes, shots, with_lenses: true, solved, target_mm: 2.0 };
         let step = progress.next();
         let sentence = step.sentence(&ids, 2.0);
         (step, sentence)

@@ -70,7 +70,7 @@ pub fn color(args: &CalibrateColorArgs, gpu: &dyn Fn() -> Result<GpuContext>) ->
     }
     let mut session = SessionBuilder::new(gpu()?, rig.clone()).settings(settings).perception(estimated).build()?;
     session.keep_observations()?;
-    let points = look_through(args, &rig, &mut session, take)?;
+    let points = sample_colors(args, &rig, &mut session, take)?;
     ensure!(!points.is_empty(), "no person is tracked; let one person walk where all cameras see them whole");
     let ids: Vec<CameraId> = rig.cameras.iter().map(|camera| camera.id.clone()).collect();
     let fit = match_colors(&ids, &points)?;
@@ -103,7 +103,7 @@ fn first_sets(args: &CalibrateColorArgs, rig: &Rig, take: Take) -> Result<Vec<Fr
 }
 
 /// Tracks people through the take and samples the colours of their surfaces.
-fn look_through(args: &CalibrateColorArgs, rig: &Rig, session: &mut Session, take: Take) -> Result<Vec<ColorPoint>> {
+fn sample_colors(args: &CalibrateColorArgs, rig: &Rig, session: &mut Session, take: Take) -> Result<Vec<ColorPoint>> {
     let secs = [args.from_secs, args.from_secs + args.secs];
     let (mut points, mut sets) = (Vec::new(), 0u64);
     let errors = take.for_each_set(rig, TakeSpan { secs, spread_nanos: 0 }, "colours, ms of the take", |set| {

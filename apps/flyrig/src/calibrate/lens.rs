@@ -6,7 +6,7 @@ use flyrig_gpu::GpuContext;
 use flyrig_report::stop;
 use flyrig_types::{CameraId, Intrinsics};
 
-use super::{output::refuse_existing, views::Seen};
+use super::{output::refuse_existing, views::SeenBoards};
 use crate::cli::CalibrateLensArgs;
 
 /// Least coverage of an image, 0..=1: below it the lens is extrapolated at the edges.
@@ -17,7 +17,7 @@ pub fn lens(args: &CalibrateLensArgs, gpu: &dyn Fn() -> Result<GpuContext>) -> R
     stop::flag();
     let board = Board::load(&args.board)?;
     refuse_existing(&args.out, &["calibration.toml"], args.force)?;
-    let seen = Seen::find(&args.take, &board, gpu)?;
+    let seen = SeenBoards::find(&args.take, &board, gpu)?;
     let lenses = solve(&board, &seen)?;
     std::fs::create_dir_all(&args.out).with_context(|| format!("cannot create {}", args.out.display()))?;
     save_lenses(&args.out, &lenses)?;
@@ -27,7 +27,7 @@ pub fn lens(args: &CalibrateLensArgs, gpu: &dyn Fn() -> Result<GpuContext>) -> R
 }
 
 /// Calibrates the lens of every camera and prints the residuals.
-pub fn solve(board: &Board, seen: &Seen) -> Result<Vec<(CameraId, Intrinsics)>> {
+pub fn solve(board: &Board, seen: &SeenBoards) -> Result<Vec<(CameraId, Intrinsics)>> {
     let mut lenses = Vec::new();
     println!(
         "{:<14} {:>6} {:>7} {:>9} {:>18} {:>16} {:>9}  lens",

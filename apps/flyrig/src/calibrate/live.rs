@@ -17,11 +17,11 @@ use flyrig_types::{CameraId, Intrinsics};
 use indicatif::{ProgressBar, ProgressStyle};
 
 use super::{
-    advice::{Progress, Step, different},
+    advice::{CalibrationState, Step, different},
     output::{FILES, refuse_existing},
     page,
-    rig::{self, PAGE, Target},
-    views::{Seen, open_frames},
+    rig::{self, PAGE, RigTarget},
+    views::{SeenBoards, open_frames},
 };
 use crate::cli::{CalibrateLiveArgs, TakeArgs};
 
@@ -47,14 +47,14 @@ pub fn live(args: &CalibrateLiveArgs, gpu: &dyn Fn() -> Result<GpuContext>) -> R
     let server = PageServer::start("--listen", &args.listen, "text/html; charset=utf-8")?;
     eprintln!("calibrate live: progress at http://{}/ (Ctrl-C calibrates with what was seen)", server.address());
     let mut watching = Watching::new(args, board.clone(), server);
-    let mut seen = Seen::look_through(opened, &board, &take_args, |seen, _| watching.look(seen))?;
+    let mut seen = SeenBoards::detect_all(opened, &board, &take_args, |seen, _| watching.update(seen))?;
     watching.show.finish_and_clear();
     different(&seen.shots, watching.looked_at, &seen.sizes, &mut watching.shots);
     seen.shots = watching.shots;
     seen.check(&board)?;
     rig::check_floor(args.floor, &seen)?;
     let lenses = rig::lenses(args.lenses.as_deref(), &board, &seen)?;
-    let target = Target { out: &args.out, floor: args.floor, no_offsets: args.no_offsets };
+    let target = RigTarget { out: &args.out, floor: args.floor, no_offsets: args.no_offsets };
     rig::solve_and_write(&target, &board, &seen, &lenses, None)
 }
 
@@ -100,7 +100,7 @@ impl<'a> Watching<'a> {
     }
 
     /// Updates the instruction from the boards so far; breaks once every camera is known well enough.
-    fn look(&mut self, seen: &Seen) -> Result<ControlFlow<()>> {
+    fn update(&mut self, seen: &SeenBoards) -> Result<ControlFlow<()>> {
         if self.last_look.is_some_and(|last| last.elapsed() < LOOK_EVERY) {
             return Ok(ControlFlow::Continue(()));
         }
@@ -114,7 +114,7 @@ impl<'a> Watching<'a> {
             // A panic has been logged already.
             self.solved = done.join().ok();
         }
-        let progress = Progress {
+        let progress = CalibrationState {
             ids: &seen.ids,
             sizes: &seen.sizes,
             shots: &self.shots,
@@ -150,7 +150,7 @@ impl<'a> Watching<'a> {
     }
 
     /// Starts a solve in its own thread, while further boards are detected.
-    fn solve(&self, seen: &Seen) -> Result<JoinHandle<Result<RigFit, CalibError>>> {
+    fn solve(&self, seen: &SeenBoards) -> Result<JoinHandle<Result<RigFit, CalibError>>> {
         let every = self.shots.len().div_ceil(SOLVED_BOARDS);
         // The first board may lie on the floor.
         let shots: Vec<BoardShot> = self.shots.iter().step_by(every).cloned().collect();
@@ -178,7 +178,7 @@ impl<'a> Watching<'a> {
 }
 
 /// Formats the table for the terminal.
-fn status(progress: &Progress<'_>, sentence: &str) -> String {
+fn status(progress: &CalibrationState<'_>, sentence: &str) -> String {
     let mut text =
         format!("{:<14} {:>7} {:>8} {:>10}  shares boards with\n", "camera", "boards", "covered", "known, mm");
     for (slot, id) in progress.ids.iter().enumerate() {

@@ -7,7 +7,7 @@ use flyrig_report::{Curve, Report, Table};
 use flyrig_types::{Camera, CameraId, ColorMatch, Intrinsics, Isometry};
 use glam::{DVec2, DVec3};
 
-use super::advice::{CELLS, Progress, WELL_LINKED};
+use super::advice::{CELLS, CalibrationState, WELL_LINKED};
 
 /// Magnification of reprojection errors in drawings.
 const LONGER: f64 = 50.0;
@@ -105,7 +105,7 @@ fn pairs(ids: &[CameraId], fit: &RigFit) -> Table {
 }
 
 /// Builds the page of a calibration under way, which browsers reload by themselves.
-pub(super) fn live(progress: &Progress<'_>, sentence: &str) -> Report {
+pub(super) fn live(progress: &CalibrationState<'_>, sentence: &str) -> Report {
     let rows = progress.ids.iter().enumerate().map(|(slot, id)| {
         let covered = format!("{:.0} %", 100.0 * progress.covered(slot));
         vec![id.to_string(), progress.boards(slot).to_string(), covered, progress.known(slot)]
@@ -135,7 +135,7 @@ pub(super) fn live(progress: &Progress<'_>, sentence: &str) -> Report {
 }
 
 /// Draws the cameras on a circle, joined by lines with the number of shared boards.
-fn links(progress: &Progress<'_>) -> String {
+fn links(progress: &CalibrationState<'_>) -> String {
     let count = progress.ids.len();
     let place = |slot: usize| {
         let angle = std::f64::consts::TAU * slot as f64 / count as f64;

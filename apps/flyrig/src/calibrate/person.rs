@@ -72,7 +72,7 @@ pub fn person(args: &CalibratePersonArgs, gpu: &dyn Fn() -> Result<GpuContext>) 
         .context("no calibration: name its folder with --calibration; flyrig calibrate rig makes one from a board")?;
     ensure!(rig.cameras.len() > 1, "one camera alone has nothing to agree with");
     let known_nanos = take.sync.lags_nanos.clone();
-    let tracks = look_through(args, &rig, plates, take)?;
+    let tracks = track_landmarks(args, &rig, plates, take)?;
     let number = |landmark: usize| LANDMARKS.iter().position(|known| *known == landmark);
     let numbers = |pairs: &[(usize, usize)]| -> Vec<(usize, usize)> {
         pairs.iter().filter_map(|(a, b)| Some((number(*a)?, number(*b)?))).collect()
@@ -115,7 +115,12 @@ pub fn person(args: &CalibratePersonArgs, gpu: &dyn Fn() -> Result<GpuContext>) 
 }
 
 /// Finds landmarks and silhouettes of the person in all images.
-fn look_through(args: &CalibratePersonArgs, rig: &Rig, plates: Vec<Option<Image>>, take: Take) -> Result<PersonTracks> {
+fn track_landmarks(
+    args: &CalibratePersonArgs,
+    rig: &Rig,
+    plates: Vec<Option<Image>>,
+    take: Take,
+) -> Result<PersonTracks> {
     let template = default_template(&ShapeParams::default())?;
     let mut viewers = Viewers::new(&PoseNet::embedded()?, &template, rig, plates, &PoseConfig::default())?;
     let mut tracks = PersonTracks::new(rig.cameras.len(), LANDMARKS.len());

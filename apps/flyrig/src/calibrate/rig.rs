@@ -14,7 +14,7 @@ use super::{
     lens,
     output::{FILES, refuse_existing},
     page,
-    views::Seen,
+    views::SeenBoards,
 };
 use crate::cli::CalibrateRigArgs;
 
@@ -33,7 +33,7 @@ const MOST_TILT_DEG: f64 = 70.0;
 const MOST_DISAGREEMENT: f64 = 1.5;
 
 /// Destination of the results, and options of the solve.
-pub(super) struct Target<'a> {
+pub(super) struct RigTarget<'a> {
     pub out: &'a Path,
     pub floor: bool,
     pub no_offsets: bool,
@@ -44,17 +44,17 @@ pub fn rig(args: &CalibrateRigArgs, gpu: &dyn Fn() -> Result<GpuContext>) -> Res
     stop::flag();
     let board = Board::load(&args.board)?;
     refuse_existing(&args.out, &[&FILES[..], &[PAGE]].concat(), args.force)?;
-    let seen = Seen::find(&args.take, &board, gpu)?;
+    let seen = SeenBoards::find(&args.take, &board, gpu)?;
     ensure!(seen.ids.len() > 1, "one camera alone is no rig; flyrig calibrate lens calibrates it");
     check_floor(args.floor, &seen)?;
     let lenses = lenses(args.lenses.as_deref(), &board, &seen)?;
     let refine = args.refine_lenses.then_some(LensModel::RadialTangential);
-    let target = Target { out: &args.out, floor: args.floor, no_offsets: args.no_offsets };
+    let target = RigTarget { out: &args.out, floor: args.floor, no_offsets: args.no_offsets };
     solve_and_write(&target, &board, &seen, &lenses, refine)
 }
 
 /// Checks that a take with `--floor` begins with the board.
-pub(super) fn check_floor(floor: bool, seen: &Seen) -> Result<()> {
+pub(super) fn check_floor(floor: bool, seen: &SeenBoards) -> Result<()> {
     if floor {
         let first = seen.shots.first().map_or(i64::MAX, |shot| shot.nanos);
         let late_secs = first.saturating_sub(seen.begin_nanos) as f64 * 1e-9;
@@ -69,9 +69,9 @@ pub(super) fn check_floor(floor: bool, seen: &Seen) -> Result<()> {
 
 /// Calibrates the poses, prints them, and writes all files.
 pub(super) fn solve_and_write(
-    args: &Target<'_>,
+    args: &RigTarget<'_>,
     board: &Board,
-    seen: &Seen,
+    seen: &SeenBoards,
     lenses: &[Intrinsics],
     refine: Option<LensModel>,
 ) -> Result<()> {
@@ -132,7 +132,7 @@ pub(super) fn solve_and_write(
 }
 
 /// Loads the lenses of a folder, or calibrates them from this take.
-pub(super) fn lenses(folder: Option<&Path>, board: &Board, seen: &Seen) -> Result<Vec<Intrinsics>> {
+pub(super) fn lenses(folder: Option<&Path>, board: &Board, seen: &SeenBoards) -> Result<Vec<Intrinsics>> {
     let Some(folder) = folder else {
         return Ok(lens::solve(board, seen)?.into_iter().map(|(_, intrinsics)| intrinsics).collect());
     };
@@ -150,7 +150,7 @@ pub(super) fn lenses(folder: Option<&Path>, board: &Board, seen: &Seen) -> Resul
     seen.ids.iter().map(of).collect()
 }
 
-fn print(seen: &Seen, fit: &RigFit, has_offsets: bool) {
+fn print(seen: &SeenBoards, fit: &RigFit, has_offsets: bool) {
     let pair =
         |values: Option<(f64, f64)>| values.map_or_else(|| "open".to_owned(), |(deg, mm)| format!("{deg:.3} {mm:.1}"));
     println!(
@@ -180,7 +180,7 @@ fn print(seen: &Seen, fit: &RigFit, has_offsets: bool) {
 }
 
 /// Formats the results of the solve as sentences, for the terminal and the page.
-fn sentences(seen: &Seen, fit: &RigFit, noise_without_offsets: Option<f64>) -> Vec<String> {
+fn sentences(seen: &SeenBoards, fit: &RigFit, noise_without_offsets: Option<f64>) -> Vec<String> {
     let mut lines = vec![format!(
         "rms {:.3} px, noise {:.3} px a coordinate, {} boards",
         fit.rms_px,
@@ -228,7 +228,7 @@ fn sentences(seen: &Seen, fit: &RigFit, noise_without_offsets: Option<f64>) -> V
 }
 
 /// `calibration.json`.
-fn report(seen: &Seen, fit: &RigFit) -> serde_json::Value {
+fn report(seen: &SeenBoards, fit: &RigFit) -> serde_json::Value {
     let cameras: Vec<_> = seen
         .ids
         .iter()

@@ -31,7 +31,7 @@ pub fn open_frames(args: &TakeArgs, gpu: &dyn Fn() -> Result<GpuContext>) -> Res
 }
 
 /// Boards that were seen in a take.
-pub struct Seen {
+pub struct SeenBoards {
     pub ids: Vec<CameraId>,
     /// Width and height of each camera's images, pixels; `None` without an image.
     pub sizes: Vec<Option<[u32; 2]>>,
@@ -43,11 +43,11 @@ pub struct Seen {
     pub begin_nanos: i64,
 }
 
-impl Seen {
+impl SeenBoards {
     /// Opens a take and detects the board, which every camera must see. `gpu` opens a graphics adapter, for simulated cameras alone.
     pub fn find(args: &TakeArgs, board: &Board, gpu: &dyn Fn() -> Result<GpuContext>) -> Result<Self> {
         let bar = progress_bar((args.secs * 1e3) as u64, "boards, ms of the take");
-        let seen = Self::look_through(open_frames(args, gpu)?, board, args, |seen, at| {
+        let seen = Self::detect_all(open_frames(args, gpu)?, board, args, |seen, at| {
             bar.set_position((at * 1e3) as u64);
             bar.set_message(format!("{} boards", seen.shots.iter().map(|shot| shot.views.len()).sum::<usize>()));
             Ok(ControlFlow::Continue(()))
@@ -58,7 +58,7 @@ impl Seen {
     }
 
     /// Detects the board in a take until its end. `each` gets the results so far and the seconds since the first frame set, and may break.
-    pub fn look_through(
+    pub fn detect_all(
         take: Take,
         board: &Board,
         args: &TakeArgs,
@@ -96,14 +96,14 @@ impl Seen {
             next = set.master_nanos.saturating_add((0.9 * every_nanos) as i64);
             batch.push(set);
             if batch.len() * count >= BATCH {
-                seen.look(&batch, detector.as_ref())?;
+                seen.detect(&batch, detector.as_ref())?;
                 batch.clear();
                 if each(&seen, at)?.is_break() {
                     break;
                 }
             }
         }
-        seen.look(&batch, detector.as_ref())?;
+        seen.detect(&batch, detector.as_ref())?;
         for (slot, id) in seen.ids.iter().enumerate() {
             match intake.last_error(slot) {
                 Some(error) if seen.images[slot] == 0 => {
@@ -116,7 +116,7 @@ impl Seen {
         Ok(seen)
     }
 
-    fn look(&mut self, sets: &[FrameSet], detector: &dyn BoardDetector) -> Result<()> {
+    fn detect(&mut self, sets: &[FrameSet], detector: &dyn BoardDetector) -> Result<()> {
         let jobs: Vec<(usize, usize)> =
             sets.iter().enumerate().flat_map(|(i, set)| set.present().map(move |(slot, _)| (i, slot))).collect();
         let found: BTreeMap<(usize, usize), BoardView> = jobs

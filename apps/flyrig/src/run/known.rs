@@ -11,7 +11,7 @@ use crate::config::Config;
 
 /// Knowledge of the person before the first image.
 #[derive(Default)]
-pub(super) struct Known {
+pub(super) struct PriorKnowledge {
     /// Colours to resume from.
     memory: Option<PersonMemory>,
     /// Body with its estimated shape.
@@ -21,7 +21,7 @@ pub(super) struct Known {
     is_dressed: bool,
 }
 
-impl Known {
+impl PriorKnowledge {
     /// Loads the person or the avatar that the configuration names; `template` is the body of its poses.
     pub fn load(config: &Config, template: &Template) -> Result<Self> {
         let mut known = Self { is_dressed: config.body.avatar_file().is_some(), ..Self::default() };
