@@ -5,20 +5,17 @@ mod checkpoint;
 mod edit;
 mod eval;
 mod export;
+mod inputs;
 mod parts;
 mod render;
 
-use std::path::{Path, PathBuf};
+use std::path::PathBuf;
 
 use anyhow::Result;
 use clap::Subcommand;
-use flyrig_avatar::Avatar;
-use flyrig_body::Template;
-use flyrig_fusion::{AppearanceOptions, BodySettings, BudgetSettings, SessionSettings};
 use flyrig_gpu::GpuContext;
-use flyrig_report::{Replay, ReplaySettings};
 
-use crate::{arguments::DatasetArgs, recording};
+use self::inputs::load;
 
 /// Subcommands of `flyrig avatar`.
 #[derive(Debug, Subcommand)]
@@ -63,50 +60,4 @@ pub fn avatar(action: &AvatarAction, gpu: &dyn Fn() -> Result<GpuContext>) -> Re
             Ok(())
         }
     }
-}
-
-fn load(path: &Path) -> Result<Avatar> {
-    Ok(Avatar::load(path)?)
-}
-
-/// Says how much of the body was in poses that the avatar was never seen in, in the mean of all frames.
-fn print_far(share: f64) {
-    if share > 0.0 {
-        println!(
-            "{:.1} % of the body was in poses unlike those that the avatar was built from (over 30 degrees from all of them); a take that \
-             shows such poses makes it better",
-            100.0 * share
-        );
-    }
-}
-
-/// Opens a take to be tracked.
-///
-/// With a known body an estimated pose moves that one.
-fn open_replay(
-    take: &DatasetArgs,
-    holdout: &[String],
-    (body, known): (&BodySettings, Option<&Template>),
-    gpu: &GpuContext,
-) -> Result<Replay> {
-    let settings = ReplaySettings {
-        dataset: take.dataset.clone(),
-        recorded: recording::rig_of_take(&take.dataset)?,
-        inputs: take.inputs.clone(),
-        holdout: holdout.to_vec(),
-        session: SessionSettings {
-            perception: take.perception.clone(),
-            body: body.clone(),
-            tracking: take.tracking.clone(),
-            appearance: AppearanceOptions::default(),
-            budget: BudgetSettings::default(),
-        },
-        fps: take.rate.fps,
-        frames: take.range.frames.clone(),
-        lags_nanos: take.lags.nanos(),
-        true_masks: false,
-        true_joints: Vec::new(),
-        body: known.map(|template| template.clone().into()),
-    };
-    Replay::open(&settings, gpu)
 }

@@ -6,14 +6,13 @@ mod color;
 mod convert;
 mod lens;
 mod live;
+mod output;
 mod page;
 mod person;
 mod rig;
 mod views;
 
-use std::path::Path;
-
-use anyhow::{Result, bail};
+use anyhow::Result;
 use clap::Subcommand;
 use flyrig_gpu::GpuContext;
 
@@ -36,18 +35,7 @@ pub enum CalibrateAction {
     Convert(convert::CalibrateConvertArgs),
 }
 
-/// Files of a calibrated rig.
-const FILES: [&str; 2] = ["calibration.toml", "calibration.json"];
-
-/// Refuses to replace files of an earlier run.
-fn refuse_existing(folder: &Path, names: &[&str], force: bool) -> Result<()> {
-    match names.iter().map(|name| folder.join(name)).find(|file| file.exists()) {
-        Some(known) if !force => bail!("{} is there already; --force replaces it", known.display()),
-        _ => Ok(()),
-    }
-}
-
-/// Runs the command. `gpu` opens a graphics adapter, for simulated cameras and for following people.
+/// Runs the command. `gpu` opens a graphics adapter, for simulated cameras and for tracking people.
 pub fn calibrate(action: &CalibrateAction, gpu: &dyn Fn() -> Result<GpuContext>) -> Result<()> {
     match action {
         CalibrateAction::Board(args) => board::board(args),

@@ -1,4 +1,4 @@
-//! `flyrig capture`: the cameras of this computer, for a rig that runs on another one.
+//! `flyrig capture`: publishes the cameras of this computer for a rig on another one.
 
 use std::{
     path::Path,
@@ -15,19 +15,17 @@ use flyrig_fusion::{Health, check_threads};
 use flyrig_gpu::GpuContext;
 use flyrig_monitor::{Arrivals, Monitor, ended_by_itself};
 use flyrig_report::stop;
+use flyrig_takes::{Needs, SourceKind, host_clock};
 use flyrig_transport::{CameraPublisher, CameraStatus, TransportConfig};
 use flyrig_types::{CameraId, Frame};
 
-use crate::{
-    config::{Config, SourceKind},
-    live, network, source,
-};
+use crate::{config::Config, opening::open_cameras};
 
-/// How often the state of cameras is published.
+/// Interval at which the state of cameras is published.
 const STATUS_EVERY: Duration = Duration::from_secs(1);
-/// How often a line with counts is printed.
+/// Interval between lines with counts.
 const PRINT_EVERY: Duration = Duration::from_secs(5);
-/// The last error of a camera without frames for so long is published.
+/// Silence of a camera after which its last error is published.
 const SILENT: Duration = Duration::from_secs(1);
 
 /// Runs the command until it is stopped or every recorded camera has ended. With a key, the cameras go to the key's rig.
@@ -37,11 +35,12 @@ pub fn capture(config: &Config, key: Option<&Path>, gpu: Option<&GpuContext>) ->
     let kind = config.source.kind;
     ensure!(kind != SourceKind::Network, "source.kind is \"network\": these cameras are on the network already");
     let mut monitor = Monitor::start(&config.health.listen, false)?;
-    let sources =
-        if kind == SourceKind::Cameras { live::openers(&config.source)? } else { source::open(config, gpu)?.cameras };
+    // Cameras of this computer need no calibration here.
+    let needs = if kind == SourceKind::Cameras { Needs::Frames } else { Needs::Calibration };
+    let sources = open_cameras(config, needs, gpu)?.sources;
     let cameras: Vec<CameraId> = sources.iter().map(|source| source.camera().clone()).collect();
     let threads = start(config, sources)?;
-    let clock = network::host_clock();
+    let clock = host_clock();
     let transport = key.map_or_else(|| config.transport(), TransportConfig::with_key);
     let publisher = CameraPublisher::open(&transport, &cameras, clock.clone())?;
     let place = match transport.connect.as_slice() {
@@ -87,7 +86,7 @@ pub fn capture(config: &Config, key: Option<&Path>, gpu: Option<&GpuContext>) ->
             let line: Vec<String> = counts
                 .iter()
                 .map(|(camera, counts)| {
-                    let watched = if counts.watched { "" } else { ", nobody listens" };
+                    let watched = if counts.watched { "" } else { ", not received" };
                     format!("{camera}: {} sent, {} overtaken{watched}", counts.sent, counts.replaced)
                 })
                 .collect();
@@ -143,7 +142,7 @@ fn status(host: &str, stats: &CameraStats, is_silent: bool) -> CameraStatus {
     }
 }
 
-/// What people call this computer.
+/// Returns the name of this computer.
 fn host_name() -> String {
     let read = |path: &str| std::fs::read_to_string(Path::new(path)).ok().map(|name| name.trim().to_owned());
     read("/proc/sys/kernel/hostname").or_else(|| std::env::var("COMPUTERNAME").ok()).unwrap_or_default()

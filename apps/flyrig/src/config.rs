@@ -1,6 +1,6 @@
 //! The configuration file: one commented default, strict reading, errors that name line and key.
 
-use std::path::{Path, PathBuf};
+use std::path::Path;
 
 use anyhow::{Context, Result, anyhow, ensure};
 use flyrig_capture::Rotation;
@@ -10,11 +10,12 @@ use flyrig_fusion::{
 };
 use flyrig_sim::SimConfig;
 use flyrig_sync::SyncSettings;
+use flyrig_takes::{SourceKind, SourceSection, TakeConfig};
 use flyrig_transport::TransportConfig;
 use flyrig_web::WebConfig;
 use serde::{Deserialize, Serialize};
 
-use crate::{cameras::CameraEntry, simulator_file, toml_errors::explain};
+use crate::{simulator_file, toml_errors::explain};
 
 /// Commented default file, as `flyrig config print` writes it; a test keeps it equal to `Config::default()`.
 pub const DEFAULT_TOML: &str = include_str!("../assets/default.toml");
@@ -89,102 +90,6 @@ pub struct RigSection {
 impl Default for RigSection {
     fn default() -> Self {
         Self { name: "flyrig".to_owned() }
-    }
-}
-
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
-#[serde(rename_all = "lowercase")]
-pub enum SourceKind {
-    Sim,
-    Folder,
-    Video,
-    #[serde(alias = "v4l2")]
-    Cameras,
-    Network,
-    Mcap,
-}
-
-impl SourceKind {
-    /// Whether frames come when they are taken, with the time of this computer.
-    pub fn is_live(self) -> bool {
-        matches!(self, Self::Cameras | Self::Network)
-    }
-}
-
-#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
-#[serde(deny_unknown_fields, default)]
-pub struct SourceSection {
-    pub kind: SourceKind,
-    pub path: PathBuf,
-    pub calibration: PathBuf,
-    pub cameras: Vec<CameraEntry>,
-    pub fps: f64,
-    pub real_time: bool,
-}
-
-impl SourceSection {
-    /// Names of the chosen cameras; none for all.
-    pub fn names(&self) -> Vec<String> {
-        self.cameras.iter().map(|entry| entry.name().to_owned()).collect()
-    }
-
-    /// Folder of the calibration; `None` where the recording holds it.
-    pub fn calibration_folder(&self) -> Option<&Path> {
-        let named = Some(self.calibration.as_path()).filter(|folder| !folder.as_os_str().is_empty());
-        named.or((self.kind != SourceKind::Mcap).then_some(self.path.as_path()))
-    }
-
-    /// Whether a calibration is named or lies in the folder. One that is damaged is there, too.
-    pub fn has_calibration(&self) -> bool {
-        let holds = |folder: &Path| {
-            ["calibration.toml", "intri.yml", "extri.yml"].iter().any(|file| folder.join(file).exists())
-        };
-        !self.calibration.as_os_str().is_empty() || !self.path.as_os_str().is_empty() && holds(&self.path)
-    }
-
-    fn check(&self) -> Result<()> {
-        for (i, entry) in self.cameras.iter().enumerate() {
-            let name = entry.name();
-            ensure!(
-                self.cameras[..i].iter().all(|before| before.name() != name),
-                "camera {name} is listed twice in source.cameras"
-            );
-            match entry {
-                CameraEntry::Named(_) if self.kind == SourceKind::Cameras => {
-                    entry.device()?;
-                }
-                CameraEntry::Named(_) => {}
-                CameraEntry::Device(section) => {
-                    ensure!(
-                        self.kind == SourceKind::Cameras,
-                        "camera {name} of source.cameras is a table, but source.kind is not \"cameras\""
-                    );
-                    section.check()?;
-                }
-            }
-        }
-        ensure!(
-            self.kind != SourceKind::Network || !self.cameras.is_empty(),
-            "source.kind is \"network\" but source.cameras names no camera"
-        );
-        ensure!(
-            self.kind != SourceKind::Cameras || !self.cameras.is_empty(),
-            "source.kind is \"cameras\" but there is no table [[source.cameras]]"
-        );
-        Ok(())
-    }
-}
-
-impl Default for SourceSection {
-    fn default() -> Self {
-        Self {
-            kind: SourceKind::Sim,
-            path: PathBuf::new(),
-            calibration: PathBuf::new(),
-            cameras: ["00", "03", "05"].map(|name| CameraEntry::Named(name.to_owned())).to_vec(),
-            fps: 30.0,
-            real_time: true,
-        }
     }
 }
 
@@ -296,7 +201,7 @@ impl Config {
             self.rig.name
         );
         range("source.fps", self.source.fps, 0.1, 1000.0)?;
-        self.source.check()?;
+        self.source.validate()?;
         ensure!(
             !self.appearance.mode.is_ablation(),
             "appearance.mode is an ablation, which `flyrig-bench appearance` measures; it must be \"direct\" or \"stfa\""
@@ -321,6 +226,18 @@ impl Config {
             tracking: self.tracking.clone(),
             appearance: self.appearance.clone(),
             budget: self.budget,
+        }
+    }
+
+    /// Returns the sections that say where frames come from and what is known about the person.
+    pub fn take(&self) -> TakeConfig {
+        TakeConfig {
+            source: self.source.clone(),
+            sim: self.sim.clone(),
+            sync: self.sync.clone(),
+            perception: self.perception.clone(),
+            template: self.body.template.clone(),
+            transport: self.transport(),
         }
     }
 

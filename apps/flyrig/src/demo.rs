@@ -22,16 +22,17 @@ use flyrig_metrics::{CameraScore, ScoreSheet, score_view};
 use flyrig_report::{
     ContactRow, Curve, Report,
     arguments::{GaussiansArgs, OutputArgs, parse_minutes},
-    contact_images, dataset, png, progress_bar, stop, write_whole,
+    contact_images, png, progress_bar, stop, write_whole,
 };
 use flyrig_sim::{FaultScript, MotionConfig, MotionKind, SimConfig, SimFrame, SimTime, Simulator};
 use flyrig_sync::SyncSettings;
+use flyrig_takes::{dataset::select_cameras, simulated_plates};
 use flyrig_transport::{Publisher, TransportConfig};
 use flyrig_types::{Camera, Frame, FrameSet, Rig};
 use indicatif::ProgressBar;
 use serde::{Deserialize as _, Serialize, de::IntoDeserializer as _};
 
-use crate::{source::simulated_plates, watch::WatchStats};
+use crate::watch::WatchStats;
 
 /// Arguments of `flyrig demo`.
 #[derive(Debug, Args)]
@@ -85,23 +86,23 @@ impl DemoArgs {
     }
 }
 
-/// Cameras that go in, and cameras that are only rendered and compared.
+/// Input cameras, and held-out cameras.
 const INPUTS: [&str; 3] = ["00", "03", "05"];
 const HELD_OUT: [&str; 4] = ["01", "02", "04", "06"];
 /// Name of the demo's rig on the network.
 const RIG_NAME: &str = "flyrig-demo";
-/// Instants that are scored against the held-out cameras.
+/// Number of instants that are scored against the held-out cameras.
 const SCORED: u64 = 20;
-/// Rows of the contact sheet, spread evenly over the run.
+/// Number of rows of the contact sheet, spread evenly over the run.
 const CONTACT_ROWS: usize = 4;
-/// How often the memory is looked at.
+/// Interval at which memory use is measured.
 const MEMORY_EVERY: Duration = Duration::from_secs(5);
-/// The viewer must have connected by then, or the demo goes on without it.
+/// Time that the viewer has to connect, before the demo goes on without it.
 const VIEWER_DEADLINE: Duration = Duration::from_secs(15);
-/// How long the viewer may take to write its last images.
+/// Time that the viewer has to write its last images.
 const VIEWER_END: Duration = Duration::from_secs(15);
 
-/// What one pass over the motion gave.
+/// Results of one pass over the motion.
 #[derive(Debug, Default)]
 struct Pass {
     sheet: ScoreSheet,
@@ -111,7 +112,7 @@ struct Pass {
     drops: Vec<(String, u64)>,
     frames: u64,
     seconds: f64,
-    /// Of `seconds`, spent on simulating held-out cameras and scoring.
+    /// Part of `seconds` that simulating held-out cameras and scoring took.
     scoring_seconds: f64,
 }
 
@@ -190,7 +191,7 @@ pub fn demo(args: &DemoArgs, gpu: &GpuContext) -> Result<()> {
     Ok(())
 }
 
-/// A kind of motion by its name in the configuration, or a file.
+/// Parses a motion: a name of the configuration, or a file.
 fn motion(name: &str) -> Result<MotionConfig> {
     let path = Path::new(name);
     let is = |extensions: &[&str]| {
@@ -236,8 +237,8 @@ fn pass(
     publisher: Option<LivePublisher>,
 ) -> Result<Pass> {
     let rig = lock(simulator)?.rig().clone();
-    let inputs = dataset::pick(&rig, &INPUTS.map(str::to_owned), "the simulated rig")?;
-    let held_out = dataset::pick(&rig, &HELD_OUT.map(str::to_owned), "the simulated rig")?.cameras;
+    let inputs = select_cameras(&rig, &INPUTS.map(str::to_owned), "the simulated rig")?;
+    let held_out = select_cameras(&rig, &HELD_OUT.map(str::to_owned), "the simulated rig")?.cameras;
     let sources: Vec<Box<dyn CameraSource>> = flyrig_sim::sources(simulator, SimTime::Exact)
         .into_iter()
         .filter(|source| inputs.slot(source.camera()).is_some())
@@ -315,7 +316,7 @@ fn pass(
     Ok(pass)
 }
 
-/// Looks for the person as in front of real cameras; only the simulator knows the shape otherwise.
+/// Finds the person as with real cameras; estimates the shape unless it is given.
 fn find_person(args: &DemoArgs, simulator: &Mutex<Simulator>, inputs: &Rig) -> Result<EstimatedPerception> {
     let mut simulator = lock(simulator)?;
     let plates = simulated_plates(&simulator, inputs)?;
@@ -334,7 +335,7 @@ fn find_person(args: &DemoArgs, simulator: &Mutex<Simulator>, inputs: &Rig) -> R
     Ok(perception)
 }
 
-/// Sets of the first seconds, from which shape and clothes are learnt.
+/// Simulates frame sets of the first seconds, from which shape and clothes are estimated.
 fn first_sets(simulator: &mut Simulator, inputs: &Rig) -> Result<Vec<FrameSet>> {
     let mut sets = Vec::new();
     for index in 0..SHAPE_SETS {
@@ -393,7 +394,7 @@ fn score(
     Ok(())
 }
 
-/// `flyrig watch` as a child process.
+/// `flyrig watch` in a child process.
 struct Viewer {
     child: Child,
     stats: PathBuf,
@@ -415,7 +416,7 @@ impl Viewer {
         Ok(Self { child, stats })
     }
 
-    /// Waits for the viewer to see the end, then reads what it measured.
+    /// Waits until the viewer has seen the end, then reads its statistics.
     fn finish(mut self) -> Option<WatchStats> {
         let deadline = Instant::now() + VIEWER_END;
         while Instant::now() < deadline && matches!(self.child.try_wait(), Ok(None)) {
@@ -441,7 +442,7 @@ fn summary(metrics: &Metrics) -> Vec<(String, String)> {
         (
             "end to end".to_owned(),
             format!(
-                "{} frames, {:.2} a second without scoring (simulating the three input cameras included)",
+                "{} frames, {:.2} per second without scoring (simulating the three input cameras included)",
                 metrics.frames, metrics.frames_per_second
             ),
         ),

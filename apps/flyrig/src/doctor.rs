@@ -5,12 +5,13 @@ use std::{fmt::Write as _, path::Path};
 use anyhow::Result;
 use flyrig_capture::NokhwaDevice;
 use flyrig_gpu::adapter_names;
+use flyrig_takes::SourceKind;
 
-use crate::config::{Config, SourceKind};
+use crate::config::Config;
 
 const NO_CAMERA: &str = "no camera: plug one in, or simulate a rig with source.kind = \"sim\"";
 
-/// Runs the command. Prints everything it can find out; fails only when the configuration cannot be read.
+/// Runs the command: prints all findings; fails only if the configuration cannot be read.
 pub fn doctor(config: Option<&Path>) -> Result<()> {
     let config = config.map(Config::load_for_capture).transpose()?;
     let mut mends = Vec::new();
@@ -69,7 +70,7 @@ fn cameras(config: Option<&Config>, mends: &mut Vec<String>) -> String {
     text
 }
 
-/// Cameras of a configuration that are opened through nokhwa and are not there.
+/// Lists the nokhwa cameras of a configuration that are missing.
 fn missing_through_nokhwa(config: Option<&Config>, mends: &mut Vec<String>) {
     let sections = config.iter().flat_map(|config| &config.source.cameras).filter_map(|entry| entry.device().ok());
     let wanted: Vec<_> = sections.filter(|section| !section.nokhwa.is_empty()).collect();
@@ -127,7 +128,7 @@ fn describe(reports: &[flyrig_capture::CameraReport], mends: &mut Vec<String>) -
     text
 }
 
-/// Who asks how much of which bus, for the cameras of a configuration.
+/// Lists the bandwidth that the cameras of a configuration need of each bus.
 #[cfg(target_os = "linux")]
 fn plan(reports: &[flyrig_capture::CameraReport], config: Option<&Config>, mends: &mut Vec<String>) -> String {
     let Some(config) = config else { return String::new() };

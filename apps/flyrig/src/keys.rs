@@ -1,4 +1,4 @@
-//! `flyrig keys`: who may connect to a rig from other computers.
+//! `flyrig keys`: keys with which other computers connect to a rig.
 
 use std::path::{Path, PathBuf};
 
@@ -83,7 +83,7 @@ fn parse_role(text: &str) -> Result<Role, String> {
         .ok_or_else(|| format!("no such role; known: {}", known.join(", ")))
 }
 
-/// End of the names of folders of keys.
+/// Ending of the names of key folders.
 const FOLDER_END: &str = "-keys";
 
 /// Runs the command.
@@ -136,7 +136,7 @@ fn line(holder: &Holder) -> String {
     format!("{:<24} {:<8} {:<21} {state}", holder.name, holder.role.name(), holder.expires)
 }
 
-/// Opens the ring that was named, or the only one in this folder.
+/// Opens the named key ring, or the only one in this folder.
 fn open(RingArgs { ring }: &RingArgs) -> Result<Ring> {
     if let Some(folder) = ring {
         return Ok(Ring::open(folder)?);
@@ -160,7 +160,7 @@ fn open(RingArgs { ring }: &RingArgs) -> Result<Ring> {
     }
 }
 
-/// Refuses to overwrite a key before anything is done.
+/// Refuses to overwrite a key, before anything is changed.
 fn new_file(out: Option<&Path>, name: &str) -> Result<PathBuf> {
     let path = out.map_or_else(|| PathBuf::from(format!("{name}.key")), Path::to_owned);
     anyhow::ensure!(

@@ -5,7 +5,6 @@
 mod arguments;
 mod avatar;
 mod calibrate;
-mod cameras;
 mod capture;
 mod cli;
 mod config;
@@ -13,20 +12,19 @@ mod demo;
 mod doctor;
 mod eval;
 mod keys;
-mod live;
-mod network;
+mod opening;
 mod plate;
 mod pose_recording;
 mod recording;
+mod replay;
 mod run;
 mod serve;
-mod silhouettes;
 mod sim_export;
 mod simulator_file;
-mod source;
+#[cfg(test)]
+mod source_tests;
 mod stream_recording;
 mod sync_check;
-mod take;
 mod toml_errors;
 mod view;
 mod watch;
@@ -39,17 +37,18 @@ use flyrig_report::{
     program::{self, open_gpu},
     traced,
 };
+use flyrig_takes::SourceKind;
 
 use crate::{
     cli::{Cli, Command, ConfigAction},
-    config::{Config, DEFAULT_TOML, SourceKind},
+    config::{Config, DEFAULT_TOML},
     sim_export::SimAction,
 };
 
-/// Reads and checks a configuration; the error is what `flyrig config check` says.
+/// Checks the text of a configuration; the error is that of `flyrig config check`.
 ///
 /// # Errors
-/// Names the key, what was found, and what is expected.
+/// Names the key, its value, and the expected values.
 pub fn check_config(text: &str) -> Result<(), String> {
     Config::parse(text).map(|_| ()).map_err(|error| program::one_line(&error))
 }
@@ -62,7 +61,7 @@ pub fn check_simulator(text: &str) -> Result<(), String> {
     simulator_file::parse(text).map(|_| ()).map_err(|error| program::one_line(&error))
 }
 
-/// Runs the command line of this process. For the beginning of `main`, before any other thread runs.
+/// Runs the command line of this process. Call it at the beginning of `main`, before any other thread starts.
 #[must_use]
 #[allow(unsafe_code)]
 pub fn main() -> ExitCode {
@@ -93,7 +92,7 @@ fn dispatch(cli: &Cli) -> Result<()> {
             let gpu = (config.source.kind == SourceKind::Sim).then(|| open_gpu(adapter)).transpose()?;
             capture::capture(&config, key.as_deref(), gpu.as_ref())
         }
-        Command::Replay(args) => recording::replay(args),
+        Command::Replay(args) => replay::replay(args),
         Command::SyncCheck(args) => sync_check::sync_check(args, &|| open_gpu(cli.adapter.as_deref())),
         Command::Plate(args) => plate::plate(args, &|| open_gpu(cli.adapter.as_deref())),
         Command::Calibrate { action } => calibrate::calibrate(action, &|| open_gpu(cli.adapter.as_deref())),

@@ -1,4 +1,4 @@
-//! `flyrig plate`: records the empty scene, with which masks compare the images.
+//! `flyrig plate`: records plates, images of the empty scene that masks are computed against.
 
 use std::{
     path::PathBuf,
@@ -11,14 +11,15 @@ use flyrig_capture::{CaptureThreads, Pacing, PopError, SourceOpener, ThreadsConf
 use flyrig_gpu::GpuContext;
 use flyrig_report::{
     arguments::{FpsArgs, parse_seconds},
-    dataset, png, progress_bar, stop, write_whole,
+    png, progress_bar, stop, write_whole,
 };
+use flyrig_takes::{Needs, TakeOptions, dataset};
 use flyrig_tracker::{PoseNet, shows_person};
 use flyrig_types::{CameraId, Frame, Image, PixelFormat};
 
 use crate::{
     arguments::TargetArgs,
-    take::{self, Take},
+    opening::open_take,
 };
 
 /// Arguments of `flyrig plate`.
@@ -35,20 +36,22 @@ pub struct PlateArgs {
     pub target: TargetArgs,
 }
 
-/// Frames of a camera that the median is taken over, spread over the time.
+/// Number of frames per camera in the median, spread over the time.
 const FRAMES: usize = 25;
-/// Seconds that live cameras may take until their first frame.
+/// Time that live cameras have for their first frame, seconds.
 const PATIENCE_SECS: f64 = 10.0;
-/// A channel that is farther from the median shows something that moved, sRGB steps.
+/// Difference of a channel from the median beyond which something moved, sRGB bytes.
 const MOVED: u8 = 28;
-/// Share of the frames in which a pixel of a still scene may have moved, and share of the pixels that may.
+/// Largest fraction of frames in which a still pixel may have moved, and of pixels that may have moved more often.
 const MOVED_FRAMES: f64 = 0.2;
 const MOVED_PIXELS: f64 = 0.01;
 
 /// Runs the command. `gpu` opens a graphics adapter, for simulated cameras alone.
 pub fn plate(args: &PlateArgs, gpu: &dyn Fn() -> Result<GpuContext>) -> Result<()> {
     stop::flag();
-    let Take { sources, pacing } = take::open(std::slice::from_ref(&args.input), args.rate.fps, gpu)?;
+    let options = TakeOptions { fps: args.rate.fps, needs: Needs::Frames, ..TakeOptions::default() };
+    let take = open_take(std::slice::from_ref(&args.input), &options, gpu)?;
+    let (pacing, sources) = (take.pacing(), take.sources);
     let cameras: Vec<CameraId> = sources.iter().map(|source| source.camera().clone()).collect();
     let folder = args.target.out.join("background");
     let files: Vec<PathBuf> = cameras.iter().map(|camera| dataset::plate_file(&folder, camera)).collect();
@@ -56,7 +59,7 @@ pub fn plate(args: &PlateArgs, gpu: &dyn Fn() -> Result<GpuContext>) -> Result<(
         bail!("{} is there already; --force replaces it", known.display());
     }
     if pacing == Pacing::AsDelivered {
-        eprintln!("recording the empty scene for {} s: nobody may be in the images", args.secs);
+        eprintln!("recording the empty scene for {} s: no person may be in the images", args.secs);
     }
     let scenes = record(args.secs, sources, pacing, &cameras)?;
     let net = PoseNet::embedded()?;
@@ -65,7 +68,7 @@ pub fn plate(args: &PlateArgs, gpu: &dyn Fn() -> Result<GpuContext>) -> Result<(
         let plate = scene.plate()?;
         if !args.target.force && shows_person(&net, &plate.image)? {
             bail!(
-                "camera {}: somebody stands in the image; leave the scene empty and try again, or accept it with --force",
+                "camera {}: a person stands in the image; leave the scene empty and try again, or accept it with --force",
                 scene.camera
             );
         }
@@ -130,15 +133,15 @@ struct Scene {
     secs: f64,
     size: [u32; 2],
     first_nanos: Option<i64>,
-    /// RGB.
+    /// RGB bytes of each frame.
     frames: Vec<Vec<u8>>,
     full: bool,
 }
 
-/// The empty scene of one camera.
+/// Empty scene of one camera.
 struct Plate {
     image: Image,
-    /// Share of the pixels that moved.
+    /// Fraction of the pixels that moved.
     moved: f64,
 }
 
@@ -147,7 +150,7 @@ impl Scene {
         Self { camera, secs, size: [0; 2], first_nanos: None, frames: Vec::new(), full: false }
     }
 
-    /// Takes the frame when it is due.
+    /// Keeps the frame if it is due.
     fn add(&mut self, frame: &Frame) -> Result<()> {
         let first = *self.first_nanos.get_or_insert(frame.capture_nanos);
         let at = frame.capture_nanos.saturating_sub(first) as f64 * 1e-9;
@@ -155,7 +158,7 @@ impl Scene {
         if self.full || at < self.secs * self.frames.len() as f64 / FRAMES as f64 {
             return Ok(());
         }
-        // A damaged frame is left out; without any the camera is named.
+        // Damaged frames are skipped; a camera without any frame is reported later.
         let Ok(rgb) = to_rgb8(&frame.image) else { return Ok(()) };
         let size = [frame.image.width(), frame.image.height()];
         if self.frames.is_empty() {
@@ -174,7 +177,7 @@ impl Scene {
         Ok(())
     }
 
-    /// The median of each channel of each pixel over the frames.
+    /// Computes the median over the frames for each channel of each pixel.
     fn plate(&self) -> Result<Plate> {
         let count = self.frames.len();
         let length = self.frames.first().map_or(0, Vec::len);

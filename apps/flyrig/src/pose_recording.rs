@@ -1,14 +1,15 @@
-//! Poses in recordings: what the rig saw and how it understood it, in one file.
+//! Poses in recordings, beside the images that they were estimated from.
 //!
-//! Topic `pose` holds foxglove `FrameTransforms` (protobuf, with its schema), one message for every set of frames that was
-//! tracked, at the set's time: for each joint the frame `person/<joint>` in that of its parent, the root in `world`. The
-//! translations are those of the person's own skeleton, so that bones have their lengths.
+//! Topic `pose` holds foxglove `FrameTransforms` (protobuf, with its schema), one message for every tracked frame set,
+//! at the frame set's time: for each joint the frame `person/<joint>` relative to its parent's, the root relative to `world`. The
+//! translations are those of the person's own skeleton, which gives bones their lengths.
 
 use std::path::Path;
 
 use anyhow::{Context as _, Result, ensure};
 use flyrig_body::Skeleton;
 use flyrig_capture::{MessageTap, Recorder, recorded_messages};
+use flyrig_takes::recorded::schema;
 use flyrig_types::Pose;
 use foxglove::{
     Decode as _, Encode as _,
@@ -16,27 +17,25 @@ use foxglove::{
 };
 use glam::{DQuat, DVec3};
 
-use crate::recording;
-
-/// Where poses are in a recording.
+/// Topic of the poses.
 const TOPIC: &str = "pose";
-/// Frame of the cameras and of the root joint.
+/// Frame of the cameras, and parent of the root joint.
 const WORLD: &str = "world";
-/// Names of joints' frames begin so.
+/// Prefix of the names of the joints' frames.
 const PERSON: &str = "person/";
-/// Joints of a message that are believed.
+/// Largest number of joints in a message.
 const MOST_JOINTS: usize = 4096;
 
-/// Poses on their way into a recording.
+/// Channel of poses in a recording.
 pub struct PoseRecording(MessageTap);
 
 impl PoseRecording {
-    /// A channel of its own in the file.
+    /// Opens the channel.
     pub fn new(recorder: &Recorder) -> Self {
-        Self(recorder.messages(TOPIC, recording::schema::<FrameTransforms>()))
+        Self(recorder.messages(TOPIC, schema::<FrameTransforms>()))
     }
 
-    /// Records a pose of an instant, nanoseconds on the clock of the frames.
+    /// Records the pose at a time in nanoseconds on the frames' clock; warns of a pose that does not fit the skeleton.
     pub fn record(&mut self, skeleton: &Skeleton, pose: &Pose, nanos: i64) {
         match encode(skeleton, pose, nanos) {
             Ok(payload) => self.0.record(nanos, payload),
@@ -68,7 +67,7 @@ fn encode(skeleton: &Skeleton, pose: &Pose, nanos: i64) -> Result<Vec<u8>> {
     Ok(bytes)
 }
 
-/// Joint names and pose out of a message.
+/// Decodes joint names and pose.
 fn decode(payload: &[u8]) -> Result<(Vec<String>, Pose)> {
     let message = FrameTransforms::decode(payload)?;
     let transforms = &message.transforms;
@@ -89,7 +88,7 @@ fn decode(payload: &[u8]) -> Result<(Vec<String>, Pose)> {
     Ok((names, pose))
 }
 
-/// What a recording's poses are, as one line; none without any.
+/// Summarizes the poses of a recording in one line; `None` without any.
 pub fn summarize(path: &Path) -> Result<Option<String>> {
     let (mut count, mut bad, mut joints) = (0u64, 0u64, 0);
     let mut times: Option<(i64, i64)> = None;
@@ -124,7 +123,7 @@ mod tests {
         for n in 0..5 {
             poses.record(&skeleton, &pose, n * 500_000_000);
         }
-        // Of another skeleton: left out, with a warning.
+        // A pose of another skeleton is skipped with a warning.
         poses.record(&skeleton, &Pose { joint_rotations: vec![DQuat::IDENTITY], ..pose.clone() }, 9);
         drop(poses);
         assert_eq!(recorder.finish().problem, None);
@@ -136,7 +135,7 @@ mod tests {
         assert!(names.iter().zip(joints).all(|(name, joint)| *name == joint.name) && names.len() == joints.len());
         assert_eq!(found, pose);
         assert_eq!(summarize(&path).unwrap().unwrap(), format!("5 of {} joints in 2.00 s", joints.len()));
-        // As any program reads it: links of a tree under "world", bones as long as the skeleton's.
+        // Other programs find a tree of links under "world", with bones as long as the skeleton's.
         let message = FrameTransforms::decode(messages[0].1.as_slice()).unwrap();
         for (transform, joint) in message.transforms.iter().zip(joints).skip(1) {
             let t = transform.translation.unwrap();

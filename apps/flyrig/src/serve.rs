@@ -27,7 +27,7 @@ pub struct ServeArgs {
     pub web: WebConfig,
 }
 
-/// How often Ctrl-C is looked at.
+/// Interval at which Ctrl-C is checked.
 const TURN: Duration = Duration::from_millis(100);
 
 /// Prints the fingerprint of the server's certificate, for comparison with the one that a browser shows.
@@ -42,7 +42,7 @@ pub fn print_fingerprint(command: &str, server: &WebServer, config: &WebConfig) 
     }
 }
 
-/// Endpoint where the page finds the relay beside it, for as long as the program runs.
+/// Returns a free loopback endpoint, at which the page reaches the relay of the same program.
 fn free_endpoint() -> Result<String> {
     let free = TcpListener::bind((Ipv4Addr::LOCALHOST, 0)).and_then(|listener| listener.local_addr());
     Ok(format!("tcp/{}", free.context("no free port on this computer")?))

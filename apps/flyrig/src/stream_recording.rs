@@ -1,6 +1,6 @@
-//! The person stream in a recording: `flyrig watch --record` writes it, `flyrig play` publishes it again.
+//! Person stream in a recording: `flyrig watch --record` writes it, `flyrig play` publishes it again.
 //!
-//! Topic `person-stream` holds every message in the order it came. A message is one byte (the layer of colours, or
+//! Topic `person-stream` holds the messages in order of arrival. A message is one byte (the layer of colours, or
 //! [`MOTION`] or [`TEMPLATE`]), the person's number (u32, little-endian) and the message's own bytes. A template comes before
 //! the first motion that needs it.
 
@@ -15,6 +15,7 @@ use clap::Args;
 use flyrig_capture::{MessageTap, Pacing, monotonic_nanos, recorded_messages};
 use flyrig_report::{arguments::parse_speed, stop};
 use flyrig_stream::{Stamp, restamp, stamp_of, template_hash};
+use flyrig_takes::recorded::recorded_cameras;
 use flyrig_transport::{Interests, PersonMessage, Publisher, Subscriber, TransportConfig};
 
 use crate::{config::RecordSection, recording, watch::WatchArgs};
@@ -51,14 +52,14 @@ const TOPIC: &str = "person-stream";
 const SCHEMA: &str = "flyrig.PersonStream";
 const MOTION: u8 = 255;
 const TEMPLATE: u8 = 254;
-/// How long a template is waited for.
+/// Longest wait for a template.
 const TEMPLATE_PATIENCE: Duration = Duration::from_secs(10);
-/// How often a line with counts is printed.
+/// Interval between lines with counts.
 const PRINT_EVERY: Duration = Duration::from_secs(5);
-/// Longest pause between two messages that is kept, seconds.
+/// Longest pause between two messages, seconds; longer ones are shortened.
 const MOST_PAUSE_SECS: f64 = 5.0;
 
-/// Writes one person's messages.
+/// Writer of the persons' messages.
 struct Writer<'a> {
     subscriber: &'a Subscriber,
     tap: MessageTap,
@@ -159,8 +160,7 @@ pub fn record(args: &WatchArgs, path: &Path) -> Result<()> {
 /// Runs `flyrig play`.
 pub fn play(args: &PlayArgs) -> Result<()> {
     let stop = stop::flag();
-    let (_, rig) = recording::recorded_cameras(&args.recording)?;
-    let rig = rig.with_context(|| {
+    let rig = recorded_cameras(&args.recording)?.rig.with_context(|| {
         format!("{} has no calibration; record it with flyrig watch --record", args.recording.display())
     })?;
     let first = recorded_messages(&args.recording, TOPIC)?.next();
@@ -212,7 +212,7 @@ pub fn play(args: &PlayArgs) -> Result<()> {
 
 struct Player<'a> {
     publisher: &'a Publisher,
-    /// Moment, own clock and recorded capture time of the message that the pace counts from.
+    /// Reference of the pace: instant, own clock and recorded capture time of a message, nanoseconds.
     clock: Option<(Instant, i64, i64)>,
     speed: f64,
     round: u32,
@@ -221,7 +221,7 @@ struct Player<'a> {
 }
 
 impl Player<'_> {
-    /// Publishes a message when its capture time has come.
+    /// Publishes a message at its capture time.
     fn play(&mut self, message: &[u8]) {
         let Some((head, bytes)) = message.split_first_chunk::<5>() else {
             self.damaged += 1;
@@ -250,7 +250,7 @@ impl Player<'_> {
         self.publisher.publish_person(&stamp, layer, bytes.into());
     }
 
-    /// Waits for the time of a recorded capture time, and returns it on this host's clock.
+    /// Waits until a recorded capture time, and returns it on this host's clock.
     fn wait_for(&mut self, capture_nanos: i64) -> i64 {
         let restart = |recorded: i64| (Instant::now(), monotonic_nanos(), recorded);
         let (began, own, recorded) = *self.clock.get_or_insert_with(|| restart(capture_nanos));

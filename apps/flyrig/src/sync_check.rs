@@ -1,4 +1,4 @@
-//! `flyrig sync-check`: do the cameras' stamps agree with what moves in their images?
+//! `flyrig sync-check`: estimates the cameras' time offsets from motion in their images.
 
 use std::time::{Duration, Instant};
 
@@ -10,12 +10,12 @@ use flyrig_report::stop;
 use flyrig_sync::{
     ClockKind, LagEstimate, MotionSignal, SilhouetteTrack, SyncSettings, estimate_lags, estimate_silhouette_lags,
 };
+use flyrig_takes::{Calibration, SilhouetteFinder, Take, TakeOptions, TakeSpan};
 use flyrig_types::{CameraId, Image, Rig};
 
 use crate::{
     arguments::{CalibrationArgs, InputArgs, SpanArgs, parse_most_ms},
-    silhouettes::Silhouettes,
-    take::{self, CalibratedTake},
+    opening::open_take,
 };
 
 /// Arguments of `flyrig sync-check`.
@@ -39,18 +39,19 @@ const ADD: &str = "add it to the camera's time_offset_ms in calibration.toml, or
 /// Runs the command. `gpu` opens a graphics adapter, for simulated cameras alone.
 pub fn sync_check(args: &SyncCheckArgs, gpu: &dyn Fn() -> Result<GpuContext>) -> Result<()> {
     stop::flag();
-    let mut take =
-        take::open_calibrated(&args.source.input, args.source.rate.fps, args.calibration.calibration.as_deref(), gpu)?;
+    let calibration = args.calibration.calibration.as_deref();
+    let options = TakeOptions { fps: args.source.rate.fps, calibration, ..TakeOptions::default() };
+    let mut take = open_take(&args.source.input, &options, gpu)?;
     let cameras: Vec<CameraId> = take.sources.iter().map(|source| source.camera().clone()).collect();
     ensure!(cameras.len() > 1, "a time offset needs at least two cameras; name another one");
     let advice = if take.is_live { ADD_TO_CAMERA } else { ADD };
-    let (estimates, frames, told, mend) = match take.calibration.take() {
-        Some((rig, plates)) if !take.is_live => {
+    let (estimates, frames, legend, advice_if_missing) = match take.calibration.take() {
+        Some(Calibration { rig, plates }) if !take.is_live => {
             let (estimates, frames) = by_silhouettes(args, &rig, plates, take)?;
-            let told = "by silhouettes; +- is the standard error, fit how much better the lag fits than others";
-            let mend = "the estimate is less certain than 5 ms: let one person whom all cameras see whole jump, squat and wave \
+            let legend = "by silhouettes; +- is the standard error, fit how much better the lag fits than others";
+            let advice_if_missing = "the estimate is less certain than 5 ms: let one person whom all cameras see whole jump, squat and wave \
                         above the head, for eight seconds";
-            (estimates, frames, told, mend)
+            (estimates, frames, legend, advice_if_missing)
         }
         _ => {
             ensure!(
@@ -62,17 +63,17 @@ pub fn sync_check(args: &SyncCheckArgs, gpu: &dyn Fn() -> Result<GpuContext>) ->
                 eprintln!("sync-check: jump and wave both arms before all cameras for {} s, please", args.span.secs);
             }
             let (estimates, frames) = by_motion(args, take.sources, &cameras, &take.sync, take.is_live)?;
-            let mend = "its motion does not correlate with that of other cameras, is too slow, or too short (under five seconds): jump and wave both \
+            let advice_if_missing = "its motion does not correlate with that of other cameras, is too slow, or too short (under five seconds): jump and wave both \
                         arms before all cameras; surer, with a calibration: flyrig record, and sync-check of the recording";
-            let told = "from motion; +- is the disagreement between camera pairs, fit the best correlation with another camera";
-            (estimates, frames, told, mend)
+            let legend = "from motion; +- is the disagreement between camera pairs, fit the best correlation with another camera";
+            (estimates, frames, legend, advice_if_missing)
         }
     };
     print(&estimates, &frames);
-    println!("{told}");
+    println!("{legend}");
     if estimates.iter().any(|estimate| estimate.lag_nanos.is_none()) {
         println!(
-            "?: {mend}. Or the offset is larger than --most-ms {}, or the clocks drift: compare --seconds 5 of an early and a late part \
+            "?: {advice_if_missing}. Or the offset is larger than --most-ms {}, or the clocks drift: compare --seconds 5 of an early and a late part \
              (--from-secs)",
             args.most_ms
         );
@@ -82,7 +83,7 @@ pub fn sync_check(args: &SyncCheckArgs, gpu: &dyn Fn() -> Result<GpuContext>) ->
     Ok(())
 }
 
-/// The lags by what moves in the images, and how many images of each camera were compared.
+/// Estimates the time offsets from motion in the images; returns them with the number of compared images per camera.
 fn by_motion(
     args: &SyncCheckArgs,
     sources: Vec<SourceOpener>,
@@ -143,33 +144,26 @@ fn print(estimates: &[LagEstimate], frames: &[usize]) {
     }
 }
 
-/// By the silhouettes of a person.
+/// Estimates the time offsets from a person's silhouettes; returns them with the number of silhouettes per camera.
 fn by_silhouettes(
     args: &SyncCheckArgs,
     rig: &Rig,
     plates: Vec<Option<Image>>,
-    take: CalibratedTake,
+    take: Take,
 ) -> Result<(Vec<LagEstimate>, Vec<usize>)> {
-    let mut silhouettes = Silhouettes::new(rig, plates, take.given_masks)?;
+    let mut silhouettes = SilhouetteFinder::new(rig, plates, take.given_masks)?;
     let mut pictures = vec![0usize; rig.cameras.len()];
-    // One camera may be ahead by as much as another is behind.
+    // One camera may lead by as much as another lags.
     let spread_nanos = (args.most_ms * 2e6) as u64;
-    let errors = take::each_set(
-        take.sources,
-        rig,
-        take.sync,
-        spread_nanos,
-        [args.span.from_secs, args.span.from_secs + args.span.secs],
-        "silhouettes, ms of the take",
-        |set| {
-            set.present().for_each(|(slot, _)| pictures[slot] += 1);
-            silhouettes.add(set)
-        },
-    )?;
+    let span = TakeSpan { secs: [args.span.from_secs, args.span.from_secs + args.span.secs], spread_nanos };
+    let errors = take.for_each_set(rig, span, "silhouettes, ms of the take", |set| {
+        set.present().for_each(|(slot, _)| pictures[slot] += 1);
+        silhouettes.add(set)
+    })?;
     let tracks = silhouettes.into_tracks();
     let frames: Vec<usize> = tracks.iter().map(SilhouetteTrack::masks).collect();
     if let Some((slot, error)) =
-        (0..pictures.len()).filter(|&slot| pictures[slot] == 0).find_map(|slot| Some((slot, errors.of(slot)?)))
+        (0..pictures.len()).filter(|&slot| pictures[slot] == 0).find_map(|slot| Some((slot, errors.get(slot)?)))
     {
         bail!("no image of camera {} could be used; the last: {error}", rig.cameras[slot].id);
     }
@@ -181,20 +175,19 @@ mod tests {
     use flyrig_capture::CameraSource as _;
     use flyrig_gpu::AdapterChoice;
     use flyrig_report::arguments::FpsArgs;
-    use flyrig_report::dataset;
     use flyrig_sim::{Fault, FaultKind, FaultScript, MotionConfig, MotionKind, SimConfig, SimTime, Simulator};
+    use flyrig_takes::dataset::select_cameras;
     use rand::{RngExt as _, SeedableRng as _, rngs::SmallRng};
 
     use std::sync::{Arc, Mutex};
 
     use super::*;
-    use crate::source;
 
     const NAMES: [&str; 4] = ["00", "02", "03", "05"];
 
-    /// Four of seven simulated cameras whose stamps are off by random lags.
+    /// Four of seven simulated cameras whose timestamps have random offsets.
     struct Lagging {
-        /// Milliseconds after the first camera.
+        /// Offset from the first camera, milliseconds.
         lags_ms: [f64; 4],
         rig: Rig,
         sources: Vec<SourceOpener>,
@@ -219,14 +212,16 @@ mod tests {
                 ..SimConfig::default()
             };
             let simulator = Simulator::new(gpu, &config).unwrap();
-            let rig = dataset::pick(&simulator.reported_rig(), &NAMES.map(str::to_owned), "the simulated rig").unwrap();
+            let rig =
+                select_cameras(&simulator.reported_rig(), &NAMES.map(str::to_owned), "the simulated rig").unwrap();
             let simulator = Arc::new(Mutex::new(simulator));
             let sources = flyrig_sim::sources(&simulator, SimTime::Exact);
-            let chosen = sources.into_iter().filter(|source| NAMES.contains(&source.camera().as_str())).collect();
-            Self { lags_ms: lags_ms.map(|lag| lag - lags_ms[0]), rig, sources: source::ready(chosen) }
+            let chosen = sources.into_iter().filter(|source| NAMES.contains(&source.camera().as_str()));
+            let sources = chosen.map(|source| SourceOpener::ready(Box::new(source))).collect();
+            Self { lags_ms: lags_ms.map(|lag| lag - lags_ms[0]), rig, sources }
         }
 
-        /// By what was found, off by how many milliseconds, if anything was found; the standard error or disagreement.
+        /// Returns the error of each estimate (milliseconds; `None` if there is none) with its standard error or disagreement.
         fn off(&self, estimates: &[LagEstimate]) -> Vec<(Option<f64>, f64)> {
             let off = |(estimate, lag): (&LagEstimate, f64)| {
                 let off = estimate.lag_nanos.map(|found| found as f64 * 1e-6 - lag);
@@ -243,15 +238,9 @@ mod tests {
             self.off(&estimates)
         }
 
-        /// With silhouettes that are found in the images, without plates.
+        /// Estimates from silhouettes that are found in the images, without plates.
         fn by_silhouettes(mut self) -> Vec<(Option<f64>, f64)> {
-            let take = CalibratedTake {
-                sources: std::mem::take(&mut self.sources),
-                is_live: false,
-                calibration: None,
-                given_masks: false,
-                sync: SyncSettings::default(),
-            };
+            let take = Take::from_sources(std::mem::take(&mut self.sources));
             let (estimates, frames) = by_silhouettes(&args(), &self.rig, NAMES.map(|_| None).into(), take).unwrap();
             println!("{frames:?} silhouettes");
             self.off(&estimates)
@@ -285,9 +274,9 @@ mod tests {
 
     #[test]
     #[ignore = "minutes: run by make test-long"]
-    fn lags_by_motion_are_right_or_not_told() {
+    fn lags_by_motion_are_right_or_not_reported() {
         let gpu = GpuContext::new(&AdapterChoice::Best).unwrap();
-        // Slow movements look different from every side: no answer is better than a wrong one.
+        // Slow movements look different from every side: no estimate is better than a wrong one.
         let waving = (2..6).map(|seed| (MotionKind::Wave, seed));
         for (kind, seed) in waving.chain([(MotionKind::Squat, 6), (MotionKind::Turn, 7)]) {
             println!("{kind:?} {seed}");
@@ -299,7 +288,7 @@ mod tests {
 
     #[test]
     #[ignore = "minutes: run by make test-long"]
-    fn lags_by_silhouettes_are_right_within_their_error_or_not_told() {
+    fn lags_by_silhouettes_are_right_within_their_error_or_not_reported() {
         let gpu = GpuContext::new(&AdapterChoice::Best).unwrap();
         use MotionKind::{CrossArms, Dance, Jump, Squat, Turn, Walk, Wave};
         let all = [(Jump, 11), (Jump, 12), (Squat, 13), (Dance, 14)];
@@ -308,7 +297,7 @@ mod tests {
             println!("{kind:?} {seed}");
             for (off, error) in Lagging::new(&gpu, seed, kind, 256, 240).by_silhouettes() {
                 let is_all = all.contains(&(kind, seed));
-                assert!(off.is_some() || !is_all, "{kind:?} {seed}: not told, standard error {error} ms");
+                assert!(off.is_some() || !is_all, "{kind:?} {seed}: not reported, standard error {error} ms");
                 let bound = if is_all { 2.0 } else { 2.0f64.max(3.0 * error) };
                 assert!(off.is_none_or(|off| off.abs() <= bound), "{kind:?} {seed}: off by {off:?} of {bound} ms");
             }

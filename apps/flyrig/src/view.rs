@@ -1,4 +1,4 @@
-//! `flyrig view`: a window in which one walks around the people of a running rig.
+//! `flyrig view`: a window with a free viewpoint on the people of a running rig.
 
 use std::path::PathBuf;
 
@@ -34,7 +34,7 @@ pub struct ViewArgs {
     pub stop: StopArgs,
 }
 
-/// Time for a screenshot, seconds, unless another one is given.
+/// Default time until a screenshot is taken, seconds.
 const SCREENSHOT_SECS: f64 = 60.0;
 
 /// Runs the command.

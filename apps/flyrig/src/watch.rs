@@ -1,4 +1,4 @@
-//! `flyrig watch`: a viewer in a process of its own.
+//! `flyrig watch`: a viewer without a window, which writes images or a video.
 
 use std::{
     collections::BTreeMap,
@@ -72,12 +72,12 @@ fn parse_vec3(text: &str) -> Result<[f64; 3], String> {
     numbers.try_into().ok().filter(|_| text.split(',').count() == 3).ok_or_else(|| format!("'{text}' is not x,y,z"))
 }
 
-/// How often rates are printed.
+/// Interval between lines with rates.
 const PRINT_EVERY: Duration = Duration::from_secs(1);
-/// Frame rate written into a video: the images come as they come, a file needs one number.
+/// Nominal frame rate of a video, frames per second: images arrive irregularly, but a file needs one number.
 const VIDEO_FPS: f64 = 25.0;
 
-/// `--stats`.
+/// Statistics of `--stats`.
 #[derive(Debug, Default, Serialize, Deserialize)]
 pub struct WatchStats {
     pub received: u64,
@@ -92,12 +92,12 @@ pub struct WatchStats {
     pub latency_is_exact: Option<bool>,
 }
 
-/// Unusable messages of other programs: counted by kind, reported the 1st, 2nd, 4th time. It never ends the command.
+/// Counts of unusable messages by kind, reported the 1st, 2nd, 4th time. Such messages do not end the command.
 #[derive(Debug, Default)]
 struct Complaints(BTreeMap<&'static str, u64>);
 
 impl Complaints {
-    /// Counts one more; the line to print, if it is time.
+    /// Counts a message; returns the line to print if one is due.
     fn count(&mut self, kind: &'static str, text: impl std::fmt::Display) -> Option<String> {
         let count = self.0.entry(kind).or_default();
         *count += 1;
@@ -182,7 +182,7 @@ pub fn watch(args: &WatchArgs) -> Result<()> {
     }
     let stats = stats(&subscriber, received, first.map_or(0.0, |first| first.elapsed().as_secs_f64()));
     eprintln!(
-        "watch: {received} images, {} missed, {} replaced unseen, {:.1} a second",
+        "watch: {received} images, {} missed, {} replaced unseen, {:.1} per second",
         stats.missed, stats.replaced, stats.images_per_second
     );
     if let Some(path) = &args.stats {
@@ -256,7 +256,7 @@ fn stats(subscriber: &Subscriber, received: u64, seconds: f64) -> WatchStats {
     stats
 }
 
-/// Where images go.
+/// Destination of the images.
 enum Sink {
     Folder(PathBuf),
     Video { path: PathBuf, writer: Option<(VideoWriter, u32, u32)> },
@@ -272,7 +272,7 @@ impl Sink {
         Ok(Self::Folder(path.to_owned()))
     }
 
-    /// Writes an image; one that cannot be used is skipped. Errors are those of the disk and of the encoder.
+    /// Writes an image and skips an unusable one. Errors are those of the disk and of the encoder.
     fn write(&mut self, picture: &Received<ViewFrame>, complaints: &mut Complaints) -> Result<()> {
         let body = &picture.body;
         let rgb = match decode(body) {
@@ -315,7 +315,7 @@ impl Sink {
     }
 }
 
-/// Decodes an image of the size that its message states, within that size's memory.
+/// Decodes an image of the size that its message states, with memory limited to that size.
 fn decode(frame: &ViewFrame) -> Result<image::RgbImage> {
     let format = match frame.format {
         ImageFormat::Jpeg => image::ImageFormat::Jpeg,

@@ -1,38 +1,40 @@
-//! Where the error of a drawn image lies: what better colours could gain, and what only a better surface could.
+//! Parts of a rendered image's error: the gain of better colours, and the rest, which needs a better surface.
 
 use flyrig_types::Mask;
 use serde::Serialize;
 
-use crate::Picture;
+use crate::image_metrics::{Picture, PixelBox};
 
-/// Colours that are right but for detail finer than this: standard deviations in pixels.
+/// Scales of detail: standard deviations of Gaussian blur, pixels.
 pub const SCALES_PX: [f64; 3] = [8.0, 4.0, 2.0];
 
-/// From this coverage on a pixel counts as wholly covered.
+/// Least coverage of a fully covered pixel.
 const COVERED: u8 = 250;
-/// Decibels stand for a perfect image beyond this.
+/// Largest reported gain, decibels.
 const MOST_DB: f64 = 99.0;
 
-/// Parts of an image's squared error, and what mending each would gain.
+/// Parts of an image's squared error, and the PSNR that removing each would gain.
 #[derive(Debug, Clone, Copy, PartialEq, Default, Serialize)]
 pub struct ErrorParts {
-    /// Share of the squared error where drawing or truth cover a pixel in part or not at all.
+    /// Fraction of the squared error in pixels that the rendered view or the truth does not cover fully, 0..=1.
     pub silhouette: f64,
-    /// dB that perfect colours would gain where both cover the pixel.
+    /// Gain of perfect colours in pixels that both cover fully, dB.
     pub colors_db: f64,
-    /// dB that colours would gain there which are right but for detail finer than each of [`SCALES_PX`]: the difference of
-    /// the two images, blurred, is taken off. Nobody without the truth could do so; it is a bound.
+    /// Gain of colours there that are right up to detail finer than each of [`SCALES_PX`], dB: the blurred difference of the
+    /// two images is subtracted. This is a bound, since it takes the truth.
     pub smooth_db: [f64; 3],
 }
 
 impl ErrorParts {
-    /// Of two images on black of one size, inside `area` (left, top, right, bottom). `drawn` is our coverage.
-    pub fn new(ours: &Picture, truth: &Picture, drawn: &Mask, mask: &Mask, area: [u32; 4]) -> Self {
+    /// Computes the parts for two images on black of equal size, inside `area`. `rendered` is the coverage of `ours`, `mask` that of
+    /// `truth`.
+    #[must_use]
+    pub fn new(ours: &Picture, truth: &Picture, rendered: &Mask, mask: &Mask, area: PixelBox) -> Self {
         let [left, top, right, bottom] = area;
         let width = (right - left) as usize;
-        let at = |x: u32, y: u32| (y * ours.width() + x) as usize;
+        let at = |x: u32, y: u32| (y * ours.size().0 + x) as usize;
         let places: Vec<usize> = (top..bottom).flat_map(|y| (left..right).map(move |x| at(x, y))).collect();
-        let covered = |i: usize| drawn.coverage()[i] >= COVERED && mask.coverage()[i] >= COVERED;
+        let covered = |i: usize| rendered.coverage()[i] >= COVERED && mask.coverage()[i] >= COVERED;
         let inside: Vec<bool> = places.iter().map(|&i| covered(i)).collect();
         let difference: Vec<[f64; 3]> = places
             .iter()
@@ -58,7 +60,8 @@ impl ErrorParts {
         }
     }
 
-    /// Mean of several; `None` of none.
+    /// Returns the mean of several; `None` for an empty slice.
+    #[must_use]
     pub fn mean(parts: &[Self]) -> Option<Self> {
         let over = |pick: &dyn Fn(&Self) -> f64| parts.iter().map(pick).sum::<f64>() / parts.len() as f64;
         (!parts.is_empty()).then(|| Self {
@@ -83,7 +86,7 @@ impl std::fmt::Display for ErrorParts {
     }
 }
 
-/// Gaussian blur among the pixels inside alone.
+/// Blurs the pixels inside by a Gaussian, normalized over these pixels alone; 0 where no pixel inside is near.
 fn blurred(values: &[[f64; 3]], inside: &[bool], width: usize, sigma: f64) -> Vec<[f64; 3]> {
     let radius = (2.5 * sigma).ceil() as usize;
     let kernel: Vec<f64> = (0..=radius).map(|d| (-0.5 * (d as f64 / sigma).powi(2)).exp()).collect();
@@ -140,7 +143,7 @@ mod tests {
         let whole = mask(|_, _| true);
         let parts =
             ErrorParts::new(&picture(|x, _| 100 + 40 * (x / 2 % 2) as u8), &picture(|_, _| 120), &whole, &whole, ALL);
-        assert!(parts.smooth_db.iter().all(|db| *db < 0.3), "{parts:?}"); // the borders are lopsided
+        assert!(parts.smooth_db.iter().all(|db| *db < 0.3), "{parts:?}"); // at the borders the blur is one-sided
         assert!(parts.colors_db > 98.0, "{parts:?}");
     }
 

@@ -1,4 +1,4 @@
-//! How far two images are apart, inside a box around the person.
+//! Metrics of two images inside a box around the person.
 //!
 //! PSNR and SSIM agree with OpenCV-based reference scripts: sRGB values in 0..=1, data range 1.
 
@@ -10,55 +10,55 @@ use flyrig_types::Mask;
 pub use flip::{FlipMap, flip};
 pub use ssim::ssim;
 
-/// Part of an image in pixels: `[x0, y0, x1, y1]`, ends excluded.
+/// Box in an image, pixels: `[x0, y0, x1, y1]`, ends excluded.
 pub type PixelBox = [u32; 4];
 
-/// Margin around the person in our evaluation, pixels.
+/// Margin around the person in evaluations, pixels.
 pub const BOX_MARGIN_PX: u32 = 10;
 
-/// PSNR of equal images, decibels; no PSNR is reported higher.
+/// PSNR of equal images and largest reported PSNR, decibels.
 pub const MAX_PSNR_DB: f64 = 99.0;
 
-/// Why two images cannot be compared.
+/// Reason why two images cannot be compared.
 #[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
 pub enum MetricError {
-    /// An image that cannot be read.
+    /// Image that cannot be read.
     #[error("{0}")]
     Image(String),
-    /// Two sizes.
+    /// Images of different size.
     #[error("images of different size cannot be compared: {}x{} and {}x{}", first.0, first.1, second.0, second.1)]
     SizeMismatch {
-        /// Pixels.
+        /// Width and height of the first image, pixels.
         first: (u32, u32),
-        /// Pixels.
+        /// Width and height of the second image, pixels.
         second: (u32, u32),
     },
-    /// The byte count does not fit the size.
+    /// Number of values that does not fit the size.
     #[error("a {width}x{height} image needs {needed} values but has {found}")]
     ByteCount {
-        /// Pixels.
+        /// Width, pixels.
         width: u32,
-        /// Pixels.
+        /// Height, pixels.
         height: u32,
-        /// Values.
+        /// Expected number of values.
         needed: usize,
-        /// Values.
+        /// Number of values.
         found: usize,
     },
-    /// No pixel to compare.
+    /// Box without pixels.
     #[error("the box {area:?} (x0, y0, x1, y1) holds no pixel of a {width}x{height} image")]
     EmptyBox {
-        /// The box.
+        /// Box.
         area: PixelBox,
-        /// Pixels.
+        /// Width of the image, pixels.
         width: u32,
-        /// Pixels.
+        /// Height of the image, pixels.
         height: u32,
     },
-    /// Nobody in the image.
+    /// Mask without a person.
     #[error("the mask is empty: there is no person to put a box around")]
     EmptyMask,
-    /// A poisoned image.
+    /// Pixel that is not finite.
     #[error("pixel ({x}, {y}) is not a finite number")]
     NotFinite {
         /// Column.
@@ -68,7 +68,7 @@ pub enum MetricError {
     },
 }
 
-/// An image as the metrics see it: sRGB values in 0..=1.
+/// Image to compare: sRGB values in 0..=1.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Picture {
     width: u32,
@@ -77,7 +77,7 @@ pub struct Picture {
 }
 
 impl Picture {
-    /// From sRGB values; clamped to 0..=1.
+    /// Creates an image from sRGB values, row by row; clamps them to 0..=1.
     ///
     /// # Errors
     /// [`MetricError::ByteCount`], [`MetricError::NotFinite`].
@@ -91,7 +91,7 @@ impl Picture {
         Ok(Self { width, height, pixels })
     }
 
-    /// From RGB bytes.
+    /// Creates an image from RGB bytes.
     ///
     /// # Errors
     /// [`MetricError::ByteCount`].
@@ -101,7 +101,7 @@ impl Picture {
         Ok(Self { width, height, pixels })
     }
 
-    /// Straight-alpha RGBA bytes on black, multiplied without rounding.
+    /// Composites straight-alpha RGBA bytes on black, without rounding.
     ///
     /// # Errors
     /// [`MetricError::ByteCount`].
@@ -111,7 +111,7 @@ impl Picture {
         Ok(Self { width, height, pixels })
     }
 
-    /// Straight-alpha RGBA bytes over a background, without rounding.
+    /// Composites straight-alpha RGBA bytes over a background, without rounding.
     ///
     /// # Errors
     /// [`MetricError::ByteCount`], [`MetricError::SizeMismatch`].
@@ -126,30 +126,24 @@ impl Picture {
         Ok(picture)
     }
 
-    /// Pixels.
+    /// Returns width and height, pixels.
     #[must_use]
-    pub fn width(&self) -> u32 {
-        self.width
+    pub fn size(&self) -> (u32, u32) {
+        (self.width, self.height)
     }
 
-    /// Pixels.
-    #[must_use]
-    pub fn height(&self) -> u32 {
-        self.height
-    }
-
-    /// sRGB values in 0..=1, row by row.
+    /// Returns the sRGB values in 0..=1, row by row.
     #[must_use]
     pub fn pixels(&self) -> &[[f32; 3]] {
         &self.pixels
     }
 
     fn same_size(&self, other: &Self) -> Result<(), MetricError> {
-        let (first, second) = ((self.width, self.height), (other.width, other.height));
+        let (first, second) = (self.size(), other.size());
         if first == second { Ok(()) } else { Err(MetricError::SizeMismatch { first, second }) }
     }
 
-    /// The part inside a box, which is cut at the image's border.
+    /// Returns the part inside a box, which is clipped at the image's border.
     fn crop(&self, area: PixelBox) -> Result<Self, MetricError> {
         let [x0, y0, x1, y1] = area;
         let (x1, y1) = (x1.min(self.width), y1.min(self.height));
@@ -161,14 +155,14 @@ impl Picture {
         Ok(Self { width: x1 - x0, height: y1 - y0, pixels })
     }
 
-    /// Both images inside the box.
+    /// Crops both images to the box.
     fn crop_both(&self, other: &Self, area: PixelBox) -> Result<(Self, Self), MetricError> {
         self.same_size(other)?;
         Ok((self.crop(area)?, other.crop(area)?))
     }
 }
 
-/// The person's box with a margin, cut at the image's border.
+/// Returns the bounding box of a mask with a margin, clipped at the image's border.
 ///
 /// # Errors
 /// [`MetricError::EmptyMask`].
@@ -182,7 +176,17 @@ pub fn person_box(mask: &Mask, margin_px: u32) -> Result<PixelBox, MetricError> 
     ])
 }
 
-/// Peak signal-to-noise ratio inside the box, decibels; at most [`MAX_PSNR_DB`].
+/// Computes the peak signal-to-noise ratio inside the box, decibels; at most [`MAX_PSNR_DB`].
+///
+/// ```
+/// use flyrig_metrics::{Picture, psnr, ssim};
+///
+/// let gray = |value| Picture::new(16, 16, vec![[value; 3]; 256]);
+/// let (truth, ours) = (gray(0.5)?, gray(0.6)?);
+/// assert!((psnr(&truth, &ours, [0, 0, 16, 16])? - 20.0).abs() < 1e-4);
+/// assert!(ssim(&truth, &ours, [0, 0, 16, 16])? < 1.0);
+/// # Ok::<(), flyrig_metrics::MetricError>(())
+/// ```
 ///
 /// # Errors
 /// [`MetricError::SizeMismatch`], [`MetricError::EmptyBox`].
@@ -195,7 +199,7 @@ pub fn psnr(first: &Picture, second: &Picture, area: PixelBox) -> Result<f64, Me
     Ok((-10.0 * mean_square.log10()).min(MAX_PSNR_DB))
 }
 
-/// Intersection over union of the pixels of at least half coverage, whole image; 0 when both are empty.
+/// Computes the intersection over union of the pixels with at least half coverage in the whole image; 0 if both masks are empty.
 ///
 /// # Errors
 /// [`MetricError::SizeMismatch`].

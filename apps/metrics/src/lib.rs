@@ -1,5 +1,5 @@
-//! How far images are apart: PSNR, SSIM, ꟻLIP and mask IoU of two images, scores of rendered views against held-out
-//! cameras, and which part of the error lies at the silhouette.
+//! Image metrics: PSNR, SSIM, ꟻLIP and mask IoU of two images, scores of rendered views against held-out cameras, and the part of the
+//! error at the silhouette.
 
 mod error_parts;
 mod image_metrics;

@@ -1,4 +1,4 @@
-//! Scores of rendered views against held-out images, and the images that show them.
+//! Scores of rendered views against held-out images.
 
 use std::fmt::Write as _;
 
@@ -6,14 +6,17 @@ use flyrig_capture::to_rgb8;
 use flyrig_types::{CameraId, Image, Mask, RenderedView};
 use serde::Serialize;
 
-use crate::{BOX_MARGIN_PX, ErrorParts, MetricError, Picture, flip, mask_iou, person_box, psnr, ssim};
+use crate::{
+    error_parts::ErrorParts,
+    image_metrics::{BOX_MARGIN_PX, MetricError, Picture, PixelBox, flip, mask_iou, person_box, psnr, ssim},
+};
 
 type Result<T, E = MetricError> = std::result::Result<T, E>;
 
-/// Scores of one image.
+/// Scores of one rendered image.
 #[derive(Debug, Clone, PartialEq, Serialize)]
 pub struct FrameScore {
-    /// The held-out camera.
+    /// Name of the held-out camera.
     pub camera: String,
     /// Frame number.
     pub frame: u64,
@@ -23,18 +26,18 @@ pub struct FrameScore {
     pub ssim: f64,
     /// Mean ꟻLIP error, 0..=1.
     pub flip: f64,
-    /// Intersection over union of the silhouettes, where the true mask is known.
+    /// Intersection over union of the silhouettes; `None` without a true mask.
     pub iou: Option<f64>,
-    /// Where the error lies; only after [`error_parts`].
+    /// Parts of the error; filled in from [`error_parts`].
     pub parts: Option<ErrorParts>,
 }
 
 /// Mean scores of a camera.
 #[derive(Debug, Clone, PartialEq, Serialize)]
 pub struct CameraScore {
-    /// The held-out camera, or "all".
+    /// Name of the held-out camera, or "all".
     pub camera: String,
-    /// Images scored.
+    /// Number of scored images.
     pub frames: usize,
     /// Peak signal-to-noise ratio, dB.
     pub psnr_db: f64,
@@ -42,29 +45,29 @@ pub struct CameraScore {
     pub ssim: f64,
     /// Mean ꟻLIP error, 0..=1.
     pub flip: f64,
-    /// Intersection over union of the silhouettes, where the true mask is known.
+    /// Intersection over union of the silhouettes; `None` without a true mask.
     pub iou: Option<f64>,
-    /// Where the error lies; only against a mask.
+    /// Parts of the error; only with a true mask.
     pub parts: Option<ErrorParts>,
 }
 
-/// A rendered view and the true image as they are scored, and the box around the person.
+/// Rendered view and held-out image as they are scored, and the box around the person.
 #[derive(Debug, Clone, PartialEq)]
 pub struct ScoredImages {
-    /// The rendered view.
+    /// Composited view.
     pub ours: Picture,
-    /// The held-out image.
+    /// Held-out image.
     pub truth: Picture,
-    /// Pixels `[x0, y0, x1, y1]`, ends excluded.
-    pub area: [u32; 4],
+    /// Box around the person.
+    pub area: PixelBox,
 }
 
 impl ScoredImages {
-    /// Composites both on black where the truth's mask is known, else the view over the held-out image, inside the box of
-    /// the view's own silhouette. Returns `None` when there is nobody to compare.
+    /// Composites both images on black if the true mask is known. Without it, composites the view over the held-out image, inside the
+    /// box of the view's own silhouette. Returns `None` if the mask or silhouette shows no person.
     ///
     /// # Errors
-    /// [`MetricError`] when sizes differ or the image cannot be converted to RGB.
+    /// Sizes differ, or the image cannot be converted to RGB.
     pub fn new(view: &RenderedView, truth: &Image, mask: Option<&Mask>) -> Result<Option<Self>> {
         let (width, height) = (view.width, view.height);
         let rgb = to_rgb8(truth).map_err(|error| MetricError::Image(error.to_string()))?;
@@ -85,15 +88,31 @@ impl ScoredImages {
     }
 }
 
+/// Returns the alpha of a view as its mask.
 fn own_silhouette(view: &RenderedView) -> Result<Mask> {
     let alpha = view.rgba.chunks_exact(4).map(|p| p[3]).collect();
     Mask::new(view.width, view.height, alpha).map_err(|error| MetricError::Image(error.to_string()))
 }
 
-/// Scores a rendered view; returns `None` when there is nobody to compare.
+/// Scores a rendered view; returns `None` if there is no person to compare.
+///
+/// ```
+/// use flyrig_metrics::{ScoreSheet, score_view};
+/// use flyrig_types::{CameraId, Image, Mask, PixelFormat, RenderedView};
+///
+/// let view = RenderedView { width: 32, height: 32, rgba: [90, 90, 90, 255].repeat(32 * 32) };
+/// let truth = Image::new(32, 32, PixelFormat::Rgb8, vec![90; 32 * 32 * 3])?;
+/// let mask = Mask::new(32, 32, vec![255; 32 * 32])?;
+///
+/// let mut sheet = ScoreSheet::default();
+/// sheet.extend(score_view(&CameraId::from("01"), 0, &view, &truth, Some(&mask))?);
+/// let mean = sheet.mean().expect("one image was scored");
+/// assert!(mean.psnr_db > 98.0 && mean.iou == Some(1.0));
+/// # Ok::<(), Box<dyn std::error::Error>>(())
+/// ```
 ///
 /// # Errors
-/// As [`ScoredImages::new`].
+/// See [`ScoredImages::new`].
 pub fn score_view(
     camera: &CameraId,
     frame: u64,
@@ -114,38 +133,38 @@ pub fn score_view(
     }))
 }
 
-/// Takes the error of a rendered view apart; returns `None` when there is nobody to compare.
+/// Splits the error of a rendered view into parts; returns `None` if there is no person to compare.
 ///
 /// # Errors
-/// As [`ScoredImages::new`].
+/// See [`ScoredImages::new`].
 pub fn error_parts(view: &RenderedView, truth: &Image, mask: &Mask) -> Result<Option<ErrorParts>> {
     let Some(ScoredImages { ours, truth, area }) = ScoredImages::new(view, truth, Some(mask))? else { return Ok(None) };
     Ok(Some(ErrorParts::new(&ours, &truth, &own_silhouette(view)?, mask, area)))
 }
 
-/// All scores of a run.
+/// Scores of all images of a run.
 #[derive(Debug, Default)]
 pub struct ScoreSheet {
     frames: Vec<FrameScore>,
 }
 
 impl ScoreSheet {
-    /// Adds the scores of a frame.
+    /// Adds scores.
     pub fn extend(&mut self, scores: impl IntoIterator<Item = FrameScore>) {
         self.frames.extend(scores);
     }
 
-    /// One score an image.
+    /// Returns the scores of all images.
     pub fn frames(&self) -> &[FrameScore] {
         &self.frames
     }
 
-    /// Returns the name of the reference: true masks, or our own silhouettes.
+    /// Returns the name of the reference: true masks, or the silhouettes of the rendered views.
     pub fn reference(&self) -> &'static str {
         if self.frames.iter().any(|score| score.iou.is_some()) { "mask" } else { "own silhouette" }
     }
 
-    /// Means a camera, in the order first seen.
+    /// Returns the mean scores of each camera, in the order of first appearance.
     pub fn per_camera(&self) -> Vec<CameraScore> {
         let mut names: Vec<&str> = Vec::new();
         for score in &self.frames {
@@ -159,12 +178,12 @@ impl ScoreSheet {
             .collect()
     }
 
-    /// Mean over all images.
+    /// Returns the mean over all images; `None` without any.
     pub fn mean(&self) -> Option<CameraScore> {
         mean("all", &self.frames.iter())
     }
 
-    /// PSNR over frames, a line a camera.
+    /// Returns PSNR (dB) over frame numbers, one named line per camera.
     pub fn curves(&self) -> Vec<(String, Vec<(f64, f64)>)> {
         self.per_camera()
             .into_iter()
@@ -175,12 +194,12 @@ impl ScoreSheet {
             .collect()
     }
 
-    /// For a progress bar.
+    /// Formats the mean PSNR for a progress bar.
     pub fn progress(&self) -> String {
         self.mean().map(|mean| format!("PSNR {:.2} dB", mean.psnr_db)).unwrap_or_default()
     }
 
-    /// For the terminal.
+    /// Formats the scores for the terminal.
     pub fn table(&self) -> String {
         let mut text =
             format!("{:<8} {:>6} {:>9} {:>8} {:>8} {:>9}\n", "camera", "frames", "PSNR dB", "SSIM", "FLIP", "mask IoU");
@@ -199,6 +218,7 @@ impl ScoreSheet {
     }
 }
 
+/// Averages scores; `None` without any.
 fn mean<'a>(name: &str, scores: &(impl Iterator<Item = &'a FrameScore> + Clone)) -> Option<CameraScore> {
     let frames = scores.clone().count();
     if frames == 0 {

@@ -9,7 +9,7 @@ use crate::png;
 /// Encodes truth, rendered view and ꟻLIP map, cropped to the person, as captioned PNG images.
 ///
 /// # Errors
-/// When sizes differ or an image cannot be read.
+/// Sizes differ, or an image cannot be read.
 pub fn contact_images(
     camera: &CameraId,
     view: &RenderedView,
@@ -21,7 +21,7 @@ pub fn contact_images(
     let (width, height) = (area[2] - area[0], area[3] - area[1]);
     let cut = |picture: &Picture| -> Vec<u8> {
         let row = |y: u32| {
-            let start = (y * picture.width() + area[0]) as usize;
+            let start = (y * picture.size().0 + area[0]) as usize;
             &picture.pixels()[start..start + width as usize]
         };
         (area[1]..area[3]).flat_map(row).flatten().map(|v| (v * 255.0).round() as u8).collect()

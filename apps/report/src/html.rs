@@ -1,4 +1,4 @@
-//! A self-contained HTML page: images, scores, times, memory.
+//! Self-contained HTML pages: images, scores, times, memory.
 
 use std::{fmt::Write as _, io::Write as _, path::Path};
 
@@ -11,19 +11,36 @@ use flyrig_types::escape_html;
 use crate::plot::{Line, Plot, Series};
 
 /// Contents of a report; empty parts are left out.
+///
+/// ```
+/// use flyrig_report::{Curve, Report};
+///
+/// let report = Report {
+///     title: "Memory".to_owned(),
+///     facts: vec![("adapter".to_owned(), "software".to_owned())],
+///     curves: vec![Curve {
+///         title: "Resident memory".to_owned(),
+///         x_label: "seconds".to_owned(),
+///         y_label: "MiB".to_owned(),
+///         lines: vec![("flyrig run".to_owned(), vec![(0.0, 310.0), (60.0, 312.5)])],
+///     }],
+///     ..Report::default()
+/// };
+/// assert!(report.html().contains("<h1>Memory</h1>"));
+/// ```
 #[derive(Debug, Default)]
 pub struct Report {
     /// Heading of the page.
     pub title: String,
-    /// Seconds after which browsers load the page again; `None` for a page that stays as it is.
+    /// Interval at which browsers reload the page, seconds; `None` for a static page.
     pub refresh_secs: Option<u32>,
     /// Name and value pairs: adapter, commit, frame rate, counts.
     pub facts: Vec<(String, String)>,
-    /// Sentences below the heading: what the page says in short.
+    /// Summary below the heading.
     pub sentences: Vec<String>,
     /// Tables of text.
     pub tables: Vec<Table>,
-    /// Heading and SVG of each drawing.
+    /// Heading and SVG of each drawing; the SVG is inserted unescaped.
     pub drawings: Vec<(String, String)>,
     /// Heading and rows of each table of scores.
     pub scores: Vec<(String, Vec<CameraScore>)>,
@@ -35,7 +52,7 @@ pub struct Report {
     pub contact: Vec<ContactRow>,
 }
 
-/// A table of text.
+/// Table of text.
 #[derive(Debug, Default)]
 pub struct Table {
     /// Heading.
@@ -46,7 +63,7 @@ pub struct Table {
     pub rows: Vec<Vec<String>>,
 }
 
-/// A line plot.
+/// Line plot.
 #[derive(Debug)]
 pub struct Curve {
     /// Heading.
@@ -59,7 +76,7 @@ pub struct Curve {
     pub lines: Vec<(String, Vec<(f64, f64)>)>,
 }
 
-/// A row of the contact sheet.
+/// Row of the contact sheet.
 #[derive(Debug)]
 pub struct ContactRow {
     /// Caption of the row.
@@ -87,6 +104,22 @@ impl Report {
         if let Some(secs) = self.refresh_secs {
             let _ = write!(page, "<meta http-equiv=refresh content={secs}>");
         }
+        self.write_texts(&mut page);
+        for (title, svg) in &self.drawings {
+            let _ = write!(page, "<h2>{}</h2>{svg}", escape_html(title));
+        }
+        self.write_scores(&mut page);
+        self.write_contact(&mut page);
+        self.write_stages(&mut page);
+        for curve in &self.curves {
+            let _ = write!(page, "<h2>{}</h2>{}", escape_html(&curve.title), curve.svg());
+        }
+        page.push_str("</html>\n");
+        page
+    }
+
+    /// Writes sentences, facts and tables.
+    fn write_texts(&self, page: &mut String) {
         for sentence in &self.sentences {
             let _ = write!(page, "<p>{}", escape_html(sentence));
         }
@@ -105,9 +138,9 @@ impl Report {
             let rows: String = rows.iter().map(|row| format!("<tr>{}", cells("td", row))).collect();
             let _ = write!(page, "<h2>{}</h2><table><tr>{}{rows}</table>", escape_html(title), cells("th", head));
         }
-        for (title, svg) in &self.drawings {
-            let _ = write!(page, "<h2>{}</h2>{svg}", escape_html(title));
-        }
+    }
+
+    fn write_scores(&self, page: &mut String) {
         for (name, scores) in &self.scores {
             let _ = write!(
                 page,
@@ -128,6 +161,9 @@ impl Report {
             }
             page.push_str("</table>");
         }
+    }
+
+    fn write_contact(&self, page: &mut String) {
         if !self.contact.is_empty() {
             page.push_str("<h2>Images</h2>");
         }
@@ -143,35 +179,34 @@ impl Report {
             }
             page.push_str("</div>");
         }
-        if !self.stages.is_empty() {
-            page.push_str(
-                "<h2>Time per stage</h2><table><tr><th>stage<th>frames<th>mean ms<th>median ms<th>95 % ms<th>99 % ms",
+    }
+
+    fn write_stages(&self, page: &mut String) {
+        if self.stages.is_empty() {
+            return;
+        }
+        page.push_str(
+            "<h2>Time per stage</h2><table><tr><th>stage<th>frames<th>mean ms<th>median ms<th>95 % ms<th>99 % ms",
+        );
+        for s in &self.stages {
+            let _ = write!(
+                page,
+                "<tr><td>{}<td>{}<td>{:.2}<td>{:.2}<td>{:.2}<td>{:.2}",
+                escape_html(&s.name),
+                s.frames,
+                s.mean_ms,
+                s.p50_ms,
+                s.p95_ms,
+                s.p99_ms
             );
-            for s in &self.stages {
-                let _ = write!(
-                    page,
-                    "<tr><td>{}<td>{}<td>{:.2}<td>{:.2}<td>{:.2}<td>{:.2}",
-                    escape_html(&s.name),
-                    s.frames,
-                    s.mean_ms,
-                    s.p50_ms,
-                    s.p95_ms,
-                    s.p99_ms
-                );
-            }
-            page.push_str("</table>");
         }
-        for curve in &self.curves {
-            let _ = write!(page, "<h2>{}</h2>{}", escape_html(&curve.title), curve.svg());
-        }
-        page.push_str("</html>\n");
-        page
+        page.push_str("</table>");
     }
 
     /// Writes the page, whole or not at all.
     ///
     /// # Errors
-    /// When the file cannot be written.
+    /// The file cannot be written.
     pub fn save(&self, path: &Path) -> Result<()> {
         write_whole(path, self.html().as_bytes())
     }
@@ -180,7 +215,7 @@ impl Report {
 /// Writes a file whole or not at all.
 ///
 /// # Errors
-/// Names the file and the fix.
+/// The file cannot be written; names the file and the fix.
 pub fn write_whole(path: &Path, bytes: &[u8]) -> Result<()> {
     flyrig_types::write_whole(path, |out| out.write_all(bytes))
         .with_context(|| format!("cannot write {}; check that the folder exists and has room", path.display()))
@@ -204,7 +239,7 @@ impl Curve {
         if plot.is_empty() {
             return "<p>no values</p>".to_owned();
         }
-        // Inside of a page the namespace goes without saying.
+        // Inside an HTML page the namespace is implied.
         plot.strip().replacen(" xmlns=\"http://www.w3.org/2000/svg\"", "", 1)
     }
 }

@@ -1,4 +1,4 @@
-//! Input images with the outlines of mask and drawn person: shows whether masks, pose and calibration fit.
+//! Input images with the outlines of mask and rendered person, which show whether masks, pose and calibration fit.
 
 use anyhow::Result;
 use flyrig_fusion::{PersonId, Session};
@@ -7,13 +7,13 @@ use crate::png;
 
 /// Colour of the mask's outline.
 const MASK: [u8; 3] = [0, 255, 80];
-/// Colour of the drawn person's outline.
+/// Colour of the rendered person's outline.
 const DRAWN: [u8; 3] = [255, 0, 200];
 
-/// Encodes every input view of a person's last update as a captioned PNG image.
+/// Encodes every input view of a person's last update as a captioned PNG image with outlines.
 ///
 /// # Errors
-/// When a view cannot be drawn.
+/// A view cannot be rendered.
 pub fn outlined_inputs(session: &mut Session, person: PersonId) -> Result<Vec<(String, Vec<u8>)>> {
     let mut out = Vec::new();
     for (view, camera) in session.viewed(person).into_iter().enumerate() {
@@ -32,7 +32,7 @@ pub fn outlined_inputs(session: &mut Session, person: PersonId) -> Result<Vec<(S
     Ok(out)
 }
 
-/// Paints the pixels of `rgb` that are covered by half or more in the alpha of `rgba` and have a neighbour that is not.
+/// Paints the pixels of `rgb` whose alpha in `rgba` is at least 128 while that of a neighbour is not.
 pub fn paint_outline(rgb: &mut [u8], rgba: &[u8], width: usize, height: usize, color: [u8; 3]) {
     let covered = |x: usize, y: usize| rgba[(y * width + x) * 4 + 3] >= 128;
     for y in 0..height {

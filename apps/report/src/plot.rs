@@ -22,44 +22,59 @@ const COLORS: [RGBColor; 6] = [
 const TEXT: RGBColor = RGBColor(0x11, 0x11, 0x11);
 const FAINT_TEXT: RGBColor = RGBColor(0x37, 0x41, 0x51);
 const GRID: RGBColor = RGBColor(0xe5, 0xe7, 0xeb);
-/// Plotters rounds to whole pixels, which shows as steps in a flat line: it draws on so many to each pixel of the SVG.
+/// Drawing resolution, pixels per pixel of the SVG: plotters rounds to whole pixels, which shows as steps in a flat line.
 const FINE: u32 = 4;
-/// Sizes of text in pixels of the SVG.
+/// Text sizes, pixels of the SVG.
 const TITLE_SIZE: f64 = 16.0;
 const TEXT_SIZE: f64 = 12.0;
 const LABEL_SIZE: f64 = 10.0;
-/// Distance of the legend's rows in pixels of the SVG.
+/// Distance of the legend's rows, pixels of the SVG.
 const ROW: f64 = 19.0;
-/// Plotters shrinks text by this.
+/// Factor by which plotters shrinks text.
 const SHRINK: f64 = 1.24;
-/// Series of more points are drawn without dots, which would hide their lines.
+/// Largest number of points in a series with dots; more would hide the line.
 const MOST_DOTS: usize = 100;
-/// Values beyond it are left out, so that no range of an axis overflows.
+/// Largest plotted value, so that the range of an axis does not overflow.
 const LARGEST: f64 = 1e100;
 
 type Area<'a> = DrawingArea<SVGBackend<'a>, Shift>;
 type Failure = DrawingAreaErrorKind<io::Error>;
 
-/// Points of one kind.
+/// Named points of a plot.
 pub struct Series {
     /// Name in the legend.
     pub name: String,
     /// x, y and label of each point.
     pub points: Vec<(f64, f64, String)>,
-    /// How they are joined.
+    /// Line through the points.
     pub line: Line,
 }
 
-/// The line of a series.
+/// Line of a series.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Line {
-    /// From point to point.
+    /// Line from point to point.
     Through,
-    /// Along those that no other one of the series beats in both directions (less is better).
+    /// Line along the Pareto front: points that no other point of the series beats in both directions (less is better).
     Front,
 }
 
-/// A diagram.
+/// Diagram.
+///
+/// ```
+/// use flyrig_report::plot::{Line, Plot, Series};
+///
+/// let points = vec![(1.0, 30.2, "fast".to_owned()), (8.0, 33.7, "slow".to_owned())];
+/// let plot = Plot {
+///     title: "Run time against quality".to_owned(),
+///     x_label: "ms per frame".to_owned(),
+///     y_label: "PSNR, dB".to_owned(),
+///     log_x: true,
+///     log_y: false,
+///     series: vec![Series { name: "direct appearance".to_owned(), points, line: Line::Front }],
+/// };
+/// assert!(plot.svg().starts_with("<svg"));
+/// ```
 pub struct Plot {
     /// Heading.
     pub title: String,
@@ -71,18 +86,18 @@ pub struct Plot {
     pub log_x: bool,
     /// Whether the y axis is logarithmic.
     pub log_y: bool,
-    /// The points.
+    /// Points, by series.
     pub series: Vec<Series>,
 }
 
 impl Plot {
-    /// Draws the diagram as SVG, on white.
+    /// Draws the diagram as SVG on white.
     #[must_use]
     pub fn svg(&self) -> String {
         self.drawn((820, 440), true)
     }
 
-    /// Draws the lines alone, low and wide, for a page that has its own heading.
+    /// Draws only the lines, low and wide, for a page with its own heading.
     #[must_use]
     pub(crate) fn strip(&self) -> String {
         self.drawn((820, 260), false)
@@ -102,7 +117,7 @@ impl Plot {
         })
     }
 
-    /// Draws at a size in pixels. A diagram that stands alone has its title, dots and labels.
+    /// Draws the diagram at a size in pixels, with title, dots and labels if it stands alone.
     fn draw(&self, (width, height): (u32, u32), is_alone: bool) -> Result<String, Failure> {
         let (fine_width, fine_height) = (FINE * width, FINE * height);
         let mut svg = String::new();
@@ -224,7 +239,7 @@ fn range(values: impl Iterator<Item = f64>, log: bool) -> Range<f64> {
     low - pad..high + pad
 }
 
-/// Returns 1, 2 and 5 times the powers of ten in a range: plotters marks powers of ten alone, of which a short axis has none.
+/// Returns 1, 2 and 5 times the powers of ten in a range: plotters marks only powers of ten, of which a short axis has none.
 fn log_ticks(range: &Range<f64>) -> Vec<f64> {
     let (first, last) = (range.start.log10().floor() as i32, range.end.log10().ceil() as i32);
     let factors: &[f64] = match last - first {
@@ -258,7 +273,7 @@ fn free_place(taken: &mut Vec<[f64; 4]>, [px, py]: [f64; 2], label: &str, [width
     [place[0], place[3]]
 }
 
-/// The points that no other one beats in both directions, from left to right.
+/// Returns the points that no other point beats in both directions, from left to right.
 fn front(points: &[(f64, f64)]) -> Vec<(f64, f64)> {
     let mut sorted = points.to_vec();
     sorted.sort_by(|a, b| a.0.total_cmp(&b.0).then(a.1.total_cmp(&b.1)));

@@ -14,7 +14,7 @@ use crate::write_whole;
 /// Encodes an RGB image as PNG.
 ///
 /// # Errors
-/// When the bytes do not fit the size.
+/// The bytes do not fit the size.
 pub fn encode_rgb(rgb: &[u8], width: u32, height: u32) -> Result<Vec<u8>> {
     encode(rgb, width, height, ExtendedColorType::Rgb8)
 }
@@ -22,7 +22,7 @@ pub fn encode_rgb(rgb: &[u8], width: u32, height: u32) -> Result<Vec<u8>> {
 /// Encodes a rendered view as PNG with straight alpha.
 ///
 /// # Errors
-/// When the bytes do not fit the size.
+/// The bytes do not fit the size.
 pub fn encode_rgba(view: &RenderedView) -> Result<Vec<u8>> {
     encode(&view.rgba, view.width, view.height, ExtendedColorType::Rgba8)
 }
@@ -30,7 +30,7 @@ pub fn encode_rgba(view: &RenderedView) -> Result<Vec<u8>> {
 /// Encodes the coverage of a mask as a grey PNG.
 ///
 /// # Errors
-/// When the bytes do not fit the size.
+/// The bytes do not fit the size.
 pub fn encode_mask(mask: &Mask) -> Result<Vec<u8>> {
     encode(mask.coverage(), mask.width(), mask.height(), ExtendedColorType::L8)
 }

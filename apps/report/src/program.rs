@@ -1,4 +1,4 @@
-//! First and last steps of every program: logging, the graphics adapter, the exit code.
+//! Start and end of every program: logging, graphics adapter, exit code.
 
 use std::{io::IsTerminal as _, process::ExitCode};
 
@@ -6,10 +6,10 @@ use anyhow::Result;
 use flyrig_gpu::{AdapterChoice, GpuContext};
 use tracing_subscriber::EnvFilter;
 
-/// Opens the adapter with this text in its name, or the fastest one.
+/// Opens the graphics adapter with this text in its name, or the fastest one.
 ///
 /// # Errors
-/// Says what is missing and what to install.
+/// No adapter was found; explains what to install.
 pub fn open_gpu(adapter: Option<&str>) -> Result<GpuContext> {
     let choice = match adapter {
         Some(name) if !name.is_empty() => AdapterChoice::Named(name.to_owned()),
@@ -18,10 +18,10 @@ pub fn open_gpu(adapter: Option<&str>) -> Result<GpuContext> {
     Ok(GpuContext::new(&choice)?)
 }
 
-/// Starts logging to standard error, more with each level of `verbose`; as one JSON object a line where asked to.
+/// Starts logging to standard error, in more detail with each level of `verbose`, and with one JSON object per line if `json`.
 pub fn start_log(verbose: u8, json: bool) {
     let level = match verbose {
-        // An image without a board is nothing to warn of.
+        // An image without a board is no reason for a warning.
         0 => {
             "warn,flyrig=info,flyrig_fusion=info,zenoh=error,calib_targets_chessboard=error,calib_targets_charuco=error"
         }
@@ -55,7 +55,7 @@ pub fn exit_code(result: Result<()>) -> ExitCode {
     }
 }
 
-/// Joins an error and its causes, without causes that the text before contains already.
+/// Joins an error and its causes, without causes that the text already contains.
 #[must_use]
 pub fn one_line(error: &anyhow::Error) -> String {
     let mut line = String::new();

@@ -2,7 +2,7 @@
 
 use indicatif::{ProgressBar, ProgressStyle};
 
-/// Returns a bar with rate, remaining time and a message.
+/// Returns a progress bar with rate, remaining time and a message.
 #[must_use]
 pub fn progress_bar(total: u64, what: impl Into<std::borrow::Cow<'static, str>>) -> ProgressBar {
     let style = ProgressStyle::with_template("{prefix} {bar:32} {pos}/{len} {per_sec} {eta} left {msg}")

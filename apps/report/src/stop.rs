@@ -1,4 +1,4 @@
-//! Ctrl-C and SIGTERM as a flag that loops look at.
+//! Ctrl-C and SIGTERM as a flag for loops to check.
 
 use std::sync::{
     Arc, OnceLock,
@@ -7,7 +7,7 @@ use std::sync::{
 
 static FLAG: OnceLock<Arc<AtomicBool>> = OnceLock::new();
 
-/// Returns the flag that is set once the user asked to stop. A second Ctrl-C ends the process at once.
+/// Returns the flag that the first Ctrl-C sets. A second Ctrl-C ends the process at once.
 pub fn flag() -> Arc<AtomicBool> {
     FLAG.get_or_init(|| {
         let flag = Arc::new(AtomicBool::new(false));
@@ -25,7 +25,7 @@ pub fn flag() -> Arc<AtomicBool> {
     .clone()
 }
 
-/// Whether the user asked to stop.
+/// Returns whether the user asked to stop.
 #[must_use]
 pub fn requested() -> bool {
     flag().load(Ordering::Relaxed)

@@ -1,4 +1,4 @@
-//! Stages over time as a file for Perfetto and Chrome's `about:tracing`.
+//! Timeline of stages as a file for Perfetto and Chrome's `about:tracing`.
 
 use std::path::Path;
 
@@ -8,10 +8,10 @@ use serde_json::{Value, json};
 
 use crate::write_whole;
 
-/// Runs a command and then writes the stages that it ran into a file, where one is named; also where the command has failed.
+/// Runs a command and writes its stages to the file, if one is named, even if the command fails.
 ///
 /// # Errors
-/// The command's; or names the file when it cannot be written, beforehand where its folder is missing.
+/// Errors of the command; the file cannot be written, which is checked beforehand if its folder is missing.
 pub fn traced(path: Option<&Path>, command: impl FnOnce() -> Result<()>) -> Result<()> {
     let Some(path) = path else { return command() };
     let folder = path.parent().filter(|folder| !folder.as_os_str().is_empty());
@@ -30,7 +30,7 @@ pub fn traced(path: Option<&Path>, command: impl FnOnce() -> Result<()>) -> Resu
     result.and(written)
 }
 
-/// Trace Event Format: a complete event a stage, a thread a track.
+/// Formats stages in the Trace Event Format: one complete event per stage, one thread per track.
 fn document(stages: &[TracedStage]) -> Value {
     let mut tracks: Vec<&str> = Vec::new();
     let mut events = Vec::new();

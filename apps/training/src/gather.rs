@@ -1,4 +1,4 @@
-//! From an engine's last update and held-out images to a training sample.
+//! Training samples from the last update of a session and held-out images.
 
 use anyhow::{Context as _, Result, ensure};
 use flyrig_capture::to_rgb8;
@@ -7,10 +7,10 @@ use flyrig_renderer::{AppearanceSettings, PosedGaussians};
 use flyrig_stfa::{TargetImage, TrainingSample, ViewImage, training_sample};
 use flyrig_types::{Camera, Image, Mask};
 
-/// Squares of pixels a held-out image.
+/// Number of patches per held-out image.
 const PATCHES: usize = 16;
 
-/// What a camera saw that was no input.
+/// Image of a held-out camera.
 #[derive(Debug, Clone, Copy)]
 pub struct HeldOut<'a> {
     pub camera: &'a Camera,
@@ -18,7 +18,7 @@ pub struct HeldOut<'a> {
     pub mask: &'a Mask,
 }
 
-/// A sample of the last update.
+/// Gathers a training sample from the session's last update.
 pub fn gather(
     session: &Session,
     held_out: &[HeldOut<'_>],
@@ -26,7 +26,7 @@ pub fn gather(
     seed: u64,
 ) -> Result<TrainingSample> {
     let person = PersonId::default();
-    let subject = session.subject(person).context("nobody was simulated")?;
+    let subject = session.subject(person).context("no person was simulated")?;
     let Observed { observations, pictures, center_scale, normal, .. } = session.observed(person)?;
     let pictures: Vec<ViewImage<'_>> =
         pictures.iter().map(|(width, height, rgba)| ViewImage { width: *width, height: *height, rgba }).collect();

@@ -1,7 +1,7 @@
 //! Training of the networks for learned appearance, from simulated people and recorded rigs.
 //!
-//! Everything lies in one folder and survives being killed at any time: samples are made once and kept as files, the
-//! state of the training is written whole every few hundred steps.
+//! All files lie in one folder, and a killed training resumes from them: samples are made once and kept as files, the
+//! state of the training is written every few hundred steps, whole or not at all.
 
 mod arguments;
 mod gather;
@@ -21,27 +21,30 @@ use flyrig_stfa::{Parameters, SampleErrors, TrainSettings, Trainer, TrainingSamp
 
 pub use self::arguments::{SizeName, TrainArgs};
 use self::{
-    people::People,
+    people::TrainingPeople,
     report::{Progress, Scores},
 };
 
-/// Added to the seed of the people that only measure progress.
+/// Offset of the seed of the test people, who only measure progress.
 const HELD_OUT_SEED: u64 = 1 << 40;
+/// File of the checkpoint.
+const CHECKPOINT: &str = "checkpoint.safetensors";
 /// Steps between two checkpoints.
 const CHECKPOINT_STEPS: u64 = 250;
 
-/// Makes samples, trains, and writes weights and curves into the folder of the arguments; `gpu` opens the adapter where one is needed.
+/// Makes samples, trains, and writes weights and curves to the folder of the arguments. `gpu` opens the graphics adapter if one is needed.
 ///
 /// # Errors
-/// Names what is missing, damaged, or in contradiction to a checkpoint in the folder.
+/// Names a file or setting that is missing, damaged, or contradicts a checkpoint in the folder.
 pub fn train(args: &TrainArgs, gpu: &dyn Fn() -> Result<GpuContext>) -> Result<()> {
     stop::flag();
     let started = Instant::now();
-    // What is asked for in vain is told before hours of simulation.
+    // Wrong arguments are reported before hours of simulation.
     let begin = begin(args)?;
     std::fs::create_dir_all(&args.out).with_context(|| format!("cannot create {}", args.out.display()))?;
-    let people = People { seed: args.seed, instants: args.instants, side: args.side, gaussians: args.gaussians };
-    let held_out = People { seed: args.seed.wrapping_add(HELD_OUT_SEED), ..people.clone() };
+    let people =
+        TrainingPeople { seed: args.seed, instants: args.instants, side: args.side, gaussians: args.gaussians };
+    let held_out = TrainingPeople { seed: args.seed.wrapping_add(HELD_OUT_SEED), ..people.clone() };
     let mut samples = simulated(args, &people, args.people, "samples", gpu)?;
     let mut folders = args.extra.clone();
     for dataset in &args.dataset {
@@ -54,53 +57,10 @@ pub fn train(args: &TrainArgs, gpu: &dyn Fn() -> Result<GpuContext>) -> Result<(
     }
     ensure!(!samples.is_empty(), "there is nothing to train on; ask for at least one person or data set");
 
-    let checkpoint = args.out.join("checkpoint.safetensors");
-    let settings = TrainSettings {
-        seed: args.seed,
-        steps: args.steps,
-        rate: args.rate,
-        structure: args.structure,
-        contrast: args.contrast,
-        ..TrainSettings::default()
-    };
-    let mut trainer = if checkpoint.exists() {
-        let trainer = Trainer::load(&checkpoint)?;
-        ensure!(
-            trainer.settings == settings && trainer.parameters.size == begin.size,
-            "{} was begun with other settings ({:?}, {:?}); give the same ones, or another --out",
-            checkpoint.display(),
-            trainer.parameters.size,
-            trainer.settings
-        );
-        if args.from.is_some() {
-            eprintln!("train: going on with {}; --from is for a training that begins", checkpoint.display());
-        }
-        trainer
-    } else {
-        Trainer::new(begin, settings)
-    };
+    let mut trainer = begin_or_resume(args, begin)?;
     let mut progress = Progress::open(&args.out, trainer.step)?;
-    let bar = progress_bar(args.steps, "train");
-    bar.set_position(trainer.step);
-    bar.reset_eta();
-    while trainer.step < args.steps && !stop::requested() {
-        let sample = &samples[trainer.next_sample(samples.len())];
-        if let Some(loss) = trainer.step(sample) {
-            progress.losses.push(loss);
-            bar.set_message(progress.message());
-        }
-        bar.inc(1);
-        if trainer.step % CHECKPOINT_STEPS == 0 || trainer.step == args.steps {
-            if trainer.step % (CHECKPOINT_STEPS * args.test_every) == 0 || trainer.step == args.steps {
-                progress.scores.extend(score(&trainer, &test));
-            }
-            progress.save(&args.out)?;
-            // Last: what a checkpoint tells has been written.
-            trainer.save(&checkpoint)?;
-            save_weights(args, &trainer, &progress, &people, samples.len(), started)?;
-        }
-    }
-    bar.finish_and_clear();
+    let card = Card { args, people: &people, samples: samples.len(), started };
+    train_until_end(&card, &mut trainer, &mut progress, &samples, &test)?;
     println!("{} of {} steps; {}", trainer.step, args.steps, progress.message());
     match progress.scores.last() {
         Some(scores) => println!("{scores}"),
@@ -113,7 +73,69 @@ pub fn train(args: &TrainArgs, gpu: &dyn Fn() -> Result<GpuContext>) -> Result<(
     Ok(())
 }
 
-/// What a training that is new starts from.
+/// Resumes the training of the folder's checkpoint, or begins one.
+fn begin_or_resume(args: &TrainArgs, begin: Parameters) -> Result<Trainer> {
+    let checkpoint = args.out.join(CHECKPOINT);
+    let settings = TrainSettings {
+        seed: args.seed,
+        steps: args.steps,
+        rate: args.rate,
+        structure: args.structure,
+        contrast: args.contrast,
+        ..TrainSettings::default()
+    };
+    if !checkpoint.exists() {
+        return Ok(Trainer::new(begin, settings));
+    }
+    let trainer = Trainer::load(&checkpoint)?;
+    ensure!(
+        trainer.settings == settings && trainer.parameters.size == begin.size,
+        "{} was begun with other settings ({:?}, {:?}); give the same ones, or another --out",
+        checkpoint.display(),
+        trainer.parameters.size,
+        trainer.settings
+    );
+    if args.from.is_some() {
+        eprintln!("train: going on with {}; --from is for a training that begins", checkpoint.display());
+    }
+    Ok(trainer)
+}
+
+/// Trains until the last step or Ctrl-C, and writes checkpoints.
+fn train_until_end(
+    card: &Card<'_>,
+    trainer: &mut Trainer,
+    progress: &mut Progress,
+    samples: &[TrainingSample],
+    test: &[TrainingSample],
+) -> Result<()> {
+    let args = card.args;
+    let bar = progress_bar(args.steps, "train");
+    bar.set_position(trainer.step);
+    bar.reset_eta();
+    while trainer.step < args.steps && !stop::requested() {
+        let sample = &samples[trainer.next_sample(samples.len())];
+        if let Some(loss) = trainer.step(sample) {
+            progress.losses.push(loss);
+            bar.set_message(progress.message());
+        }
+        bar.inc(1);
+        let is_last = trainer.step == args.steps;
+        if is_last || trainer.step.is_multiple_of(CHECKPOINT_STEPS) {
+            if is_last || trainer.step.is_multiple_of(CHECKPOINT_STEPS * args.test_every) {
+                progress.scores.extend(score(trainer, test));
+            }
+            progress.save(&args.out)?;
+            // Last: the files that belong to the checkpoint have been written.
+            trainer.save(&args.out.join(CHECKPOINT))?;
+            card.save_weights(trainer, progress)?;
+        }
+    }
+    bar.finish_and_clear();
+    Ok(())
+}
+
+/// Returns the initial parameters of a new training.
 fn begin(args: &TrainArgs) -> Result<Parameters> {
     Ok(match &args.from {
         None => Parameters::untrained(args.size.size(), args.seed),
@@ -121,17 +143,17 @@ fn begin(args: &TrainArgs) -> Result<Parameters> {
     })
 }
 
-/// None without anybody to measure on.
+/// Measures the scores on the test people; `None` without any.
 fn score(trainer: &Trainer, test: &[TrainingSample]) -> Option<Scores> {
     let errors: Vec<SampleErrors> =
         test.iter().filter_map(|sample| evaluate(&trainer.parameters, sample, true)).collect();
     (!errors.is_empty()).then(|| Scores::new(trainer.step, &errors))
 }
 
-/// Samples of simulated people, out of the folder as far as they lie there.
+/// Returns samples of simulated people; simulates those that the folder lacks.
 fn simulated(
     args: &TrainArgs,
-    people: &People,
+    people: &TrainingPeople,
     count: u64,
     folder: &str,
     gpu: &dyn Fn() -> Result<GpuContext>,
@@ -167,7 +189,7 @@ fn simulated(
     Ok(samples)
 }
 
-/// All samples of these folders.
+/// Reads all samples of these folders.
 fn read_extra(folders: &[PathBuf]) -> Result<Vec<TrainingSample>> {
     let mut samples = Vec::new();
     for folder in folders {
@@ -181,33 +203,38 @@ fn read_extra(folders: &[PathBuf]) -> Result<Vec<TrainingSample>> {
     Ok(samples)
 }
 
-fn save_weights(
-    args: &TrainArgs,
-    trainer: &Trainer,
-    progress: &Progress,
-    people: &People,
+/// Facts of a training that its weights are saved with.
+struct Card<'a> {
+    args: &'a TrainArgs,
+    people: &'a TrainingPeople,
+    /// Number of training samples.
     samples: usize,
     started: Instant,
-) -> Result<()> {
-    let card = serde_json::json!({
-        "flyrig": env!("CARGO_PKG_VERSION"),
-        "command": command_line(),
-        "size": trainer.parameters.size,
-        "parameters": trainer.parameters.count(),
-        "settings": trainer.settings,
-        "step": trainer.step,
-        "people": { "train": people, "count": args.people, "held_out_seed": people.seed.wrapping_add(HELD_OUT_SEED) },
-        "samples": samples,
-        "scores": progress.scores,
-        "seconds_of_this_run": started.elapsed().as_secs(),
-        "machine": format!("{} threads", rayon::current_num_threads()),
-    });
-    trainer.parameters.save(&args.out.join("weights.safetensors"), &card)?;
-    let json = serde_json::to_vec_pretty(&card)?;
-    write_whole(&args.out.join("weights.json"), &json)
 }
 
-/// The command as it was typed, folders shortened to their names.
+impl Card<'_> {
+    fn save_weights(&self, trainer: &Trainer, progress: &Progress) -> Result<()> {
+        let Self { args, people, samples, started } = self;
+        let card = serde_json::json!({
+            "flyrig": env!("CARGO_PKG_VERSION"),
+            "command": command_line(),
+            "size": trainer.parameters.size,
+            "parameters": trainer.parameters.count(),
+            "settings": trainer.settings,
+            "step": trainer.step,
+            "people": { "train": people, "count": args.people, "held_out_seed": people.seed.wrapping_add(HELD_OUT_SEED) },
+            "samples": samples,
+            "scores": progress.scores,
+            "seconds_of_this_run": started.elapsed().as_secs(),
+            "machine": format!("{} threads", rayon::current_num_threads()),
+        });
+        trainer.parameters.save(&args.out.join("weights.safetensors"), &card)?;
+        let json = serde_json::to_vec_pretty(&card)?;
+        write_whole(&args.out.join("weights.json"), &json)
+    }
+}
+
+/// Returns the command line, with paths shortened to their last part.
 fn command_line() -> String {
     let short =
         |word: String| Path::new(&word).file_name().map_or(word.clone(), |name| name.to_string_lossy().into_owned());

@@ -15,37 +15,37 @@ use serde::{Deserialize, Serialize};
 use super::gather::{HeldOut, gather};
 /// Cameras around each person.
 const CAMERAS: usize = 7;
-/// Images that are compared an instant.
+/// Number of held-out images per instant.
 const TARGETS: usize = 3;
-/// Instants before the first sample, in which the deformation finds the clothes.
+/// Number of instants before the first sample, in which the deformation converges to the clothes.
 const WARM_UP: u64 = 3;
-/// Instants before each other one.
+/// Number of instants before each further sample.
 const RUN_IN: u64 = 1;
-/// Further looks at a sample's instant, in which the sharpening of the colours settles.
+/// Number of further updates at a sample's instant, in which the sharpening of the colours converges.
 const LOOKS: usize = 6;
-/// Share of the people who are filmed in a furnished room.
+/// Fraction of the people in a furnished room.
 const FURNISHED: f64 = 0.15;
-/// Frames, a minute of them, that instants are taken from.
+/// Number of frames that instants are drawn from, a minute.
 const SPAN_FRAMES: u64 = 1800;
 
-/// Which people.
+/// Simulated people to train on.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
-pub struct People {
-    /// Makes them all; another seed gives other people.
+pub struct TrainingPeople {
+    /// Seed of all people.
     pub seed: u64,
-    /// Instants of each person, each with cameras, lens and pose of its own.
+    /// Number of instants of each person, each with its own cameras, lens and pose.
     pub instants: u64,
-    /// Pixels of an image's side, from 0.85 to 1.3 times as many for each person.
+    /// Side of an image, pixels; scaled by 0.85 to 1.3 for each person.
     pub side: u32,
-    /// Gaussians on the person's surface.
+    /// Number of Gaussians on the person's surface.
     pub gaussians: usize,
 }
 
-impl People {
-    /// The capture of one person: the simulator's random people, motion, rooms, lights, lenses and calibration errors.
-    /// What only costs time stays away: lens openings and rolling shutters (which draw the room several times), most of
-    /// the furnished rooms. Sensors differ less than at worst, since a rig's colours are matched, and the held-out
-    /// images would only teach their own casts.
+impl TrainingPeople {
+    /// Returns the capture of one person, with random body, motion, room, lights, lenses and calibration errors.
+    ///
+    /// Effects that mainly cost time are left out: apertures and rolling shutters (which render the room several times), and most
+    /// furnished rooms. Sensors differ only slightly, since a rig's colours are matched, and colour casts of held-out images would be learned.
     pub fn capture(&self, person: u64) -> SimConfig {
         let training =
             TrainingConfig { seed: self.seed, cameras: CAMERAS, size: [self.side; 2], ..TrainingConfig::default() };
@@ -67,21 +67,21 @@ impl People {
         }
         let exposure_ms = if rng.random_bool(0.2) { rng.random_range(2.0..10.0) } else { 0.0 };
         config.optics = vec![OpticsConfig { exposure_ms, samples: 3, ..OpticsConfig::default() }];
-        // A person's pixels may be finer or coarser than the Gaussians' usual ones.
+        // Pixels may be finer or coarser than usual for the Gaussians.
         let scale = rng.random_range(0.85..1.3);
         let side = ((f64::from(self.side) * scale / 16.0).round() as u32).max(4) * 16;
         (config.width, config.height) = (side, side);
         config
     }
 
-    /// Samples of one person. The same configuration gives the same samples on the same adapter.
+    /// Simulates the samples of one person; equal configurations give equal samples on the same adapter.
     pub fn samples(&self, gpu: &GpuContext, person: u64) -> Result<Vec<TrainingSample>> {
         let mut simulator = Simulator::new(gpu, &self.capture(person))?;
         let seed = simulator.config().seed;
         let mut rng = SmallRng::seed_from_u64(seed ^ 0x7069_636b);
         let (rig, reported) = (simulator.rig().clone(), simulator.reported_rig());
         let template = simulator.template().clone();
-        // With time: sharpening goes on from the last colours. What the networks are given is of this instant alone.
+        // With time: sharpening continues from the last colours. The networks' inputs are of this instant alone.
         let settings = AppearanceMode::Direct.settings();
         let body = BodySettings::with_gaussians(self.gaussians);
         let perception = GivenPerception::repeating(&reported, template, simulator.track().clone());
@@ -130,7 +130,7 @@ fn sample_of(
     gather(session, held_out, settings, seed).context("gathering a training sample")
 }
 
-/// Inputs and held-out cameras by slot: mostly three inputs that lie apart, sometimes two, or one.
+/// Draws the slots of input and held-out cameras: mostly three distant inputs, sometimes two or one.
 fn choose(rng: &mut SmallRng) -> (Vec<usize>, Vec<usize>) {
     let start = rng.random_range(0..CAMERAS);
     let places = [0, if rng.random_bool(0.5) { 2 } else { 3 }, 5];
@@ -142,7 +142,7 @@ fn choose(rng: &mut SmallRng) -> (Vec<usize>, Vec<usize>) {
     (inputs, others)
 }
 
-/// What the input cameras give at an instant; the other slots are empty.
+/// Simulates the input cameras at an instant; the other slots are empty.
 fn frame_set(simulator: &mut Simulator, rig: &Rig, instant: u64, index: u64, inputs: &[usize]) -> Result<FrameSet> {
     let nanos = simulator.frame_nanos(instant);
     let mut frames: Vec<Option<Arc<Frame>>> = vec![None; rig.cameras.len()];

@@ -8,7 +8,8 @@ use std::{
 use anyhow::{Context, Result, ensure};
 use flyrig_fusion::{BodySettings, PerceptionSettings, SessionSettings};
 use flyrig_gpu::GpuContext;
-use flyrig_report::{Replay, ReplaySettings, dataset, progress_bar, stop, write_whole};
+use flyrig_report::{progress_bar, stop, write_whole};
+use flyrig_takes::{Replay, ReplaySettings, dataset};
 use flyrig_types::CameraId;
 
 use super::{
@@ -16,7 +17,7 @@ use super::{
     gather::{HeldOut, gather},
 };
 
-/// Writes what is missing of a data set's samples into a folder below `out`, and tells which one.
+/// Writes the missing samples of a data set to a folder below `out`, and returns the folder.
 pub fn record(args: &TrainArgs, root: &Path, out: &Path, gpu: &GpuContext) -> Result<PathBuf> {
     let name = root.file_name().map_or_else(|| "dataset".to_owned(), |name| name.to_string_lossy().into_owned());
     let folder = out.join(format!("recorded-{name}"));
@@ -50,7 +51,6 @@ fn leave_out(
     ensure!(mask.is_dir(), "there are no masks of it; write them to {}", mask.display());
     let settings = ReplaySettings {
         dataset: root.to_owned(),
-        recorded: None,
         inputs: cameras.iter().filter(|camera| *camera != left_out).cloned().collect(),
         holdout: vec![left_out.clone()],
         session: SessionSettings {

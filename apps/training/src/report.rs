@@ -1,4 +1,4 @@
-//! How a training goes: curve, table, image.
+//! Progress of a training: curve, table, image.
 
 use std::{fmt, path::Path};
 
@@ -10,31 +10,31 @@ use flyrig_report::{
 use flyrig_stfa::{Loss, SampleErrors};
 use serde::{Deserialize, Serialize};
 
-/// Points of the curve.
+/// Number of points of the curve.
 const CURVE_POINTS: usize = 120;
-/// Steps that the progress bar's message is the mean of.
+/// Number of steps that the progress bar's message averages.
 const RECENT: usize = 200;
 
-/// How well people that were never trained on are painted.
+/// Scores on the test people, who are not trained on.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
 pub struct Scores {
     pub step: u64,
-    /// Mean over samples, dB.
+    /// Mean PSNR over samples, dB.
     pub psnr_db: f64,
-    /// Of direct appearance on the same pixels.
+    /// Mean PSNR of direct appearance on the same pixels, dB.
     pub direct_db: f64,
-    /// As far as drawing and truth both cover a pixel, dB: gain of the networks over direct appearance in colour alone.
+    /// Gain of the networks over direct appearance in colour alone, where rendering and truth both cover a pixel, dB.
     pub color_gain_db: f64,
-    /// Mean structural similarity of the patches, colour alone: gain over direct appearance.
+    /// Gain in the mean structural similarity of the patches over direct appearance, colour alone.
     pub ssim_gain: f64,
-    /// Fine contrast over the truth's, of the networks and of direct appearance.
+    /// Ratio of fine contrast to that of the truth, of the networks and of direct appearance.
     pub contrast: [f64; 2],
-    /// Share of the samples on which the networks are better.
+    /// Fraction of the samples on which the networks are better.
     pub better: f64,
 }
 
 impl Scores {
-    /// From mean squared errors of the networks and of direct appearance.
+    /// Averages the errors of the networks and of direct appearance.
     pub fn new(step: u64, errors: &[SampleErrors]) -> Self {
         let count = errors.len().max(1) as f64;
         let mean = |of: fn(&SampleErrors) -> f64| errors.iter().map(of).sum::<f64>() / count;
@@ -70,7 +70,7 @@ fn psnr(mse: f64) -> f64 {
     -10.0 * mse.max(1e-10).log10()
 }
 
-/// Everything that is plotted.
+/// Losses and scores so far.
 #[derive(Debug, Default)]
 pub struct Progress {
     pub losses: Vec<Loss>,
@@ -78,7 +78,7 @@ pub struct Progress {
 }
 
 impl Progress {
-    /// Reads what an earlier run left, up to the step that it is resumed at.
+    /// Reads the progress of an earlier run up to the step at which it is resumed.
     pub fn open(folder: &Path, step: u64) -> Result<Self> {
         let path = folder.join("progress.json");
         if step == 0 || !path.exists() {
@@ -92,7 +92,7 @@ impl Progress {
         Ok(Self { losses, scores })
     }
 
-    /// Recent gain over direct appearance on what is trained on.
+    /// Formats the recent gain over direct appearance on the training samples.
     pub fn message(&self) -> String {
         let recent = &self.losses[self.losses.len().saturating_sub(RECENT)..];
         let count = recent.len().max(1) as f64;
@@ -103,7 +103,7 @@ impl Progress {
         format!("{ours:.2} dB, {:+.2} over direct{held_out}", ours - direct)
     }
 
-    /// Writes table, image and what a resumed run needs.
+    /// Writes table, image, and the file from which a run resumes.
     pub fn save(&self, folder: &Path) -> Result<()> {
         write_whole(&folder.join("progress.json"), &serde_json::to_vec(&(&self.losses, &self.scores))?)?;
         let rows: Vec<String> =

@@ -82,7 +82,7 @@ impl ConnectionPlace {
     /// Ends the handshake: the connection does not count against its address any more.
     pub fn established(&mut self) {
         if let Some((limits, address)) = self.handshake.take() {
-            lock(&limits).end(address);
+            lock(limits).end(address);
         }
     }
 }
@@ -201,7 +201,7 @@ async fn accept(listener: &TcpListener, bounds: Bounds, service: &Arc<impl Serve
             continue;
         };
         let address = address.ip();
-        let begins = |limits: &Mutex<Limits>| lock(&limits).begin(address, Instant::now());
+        let begins = |limits: &Mutex<Limits>| lock(limits).begin(address, Instant::now());
         if limits.as_deref().is_some_and(|limits| !begins(limits)) {
             service.refuse(address);
             continue;

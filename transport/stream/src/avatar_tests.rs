@@ -7,7 +7,7 @@ use rand::{RngExt as _, SeedableRng as _, rngs::StdRng};
 
 use super::*;
 use crate::{
-    MotionEncoder,
+    LIGHT_TERMS, MotionEncoder,
     testing::{Person, damaged},
 };
 

@@ -20,12 +20,11 @@ use flyrig_gpu::GpuContext;
 use flyrig_metrics::{CameraScore, ScoreSheet, score_view};
 use flyrig_renderer::HarmonicOrder;
 use flyrig_report::{
-    AvatarTake, Replay, ReplaySettings,
     arguments::{OutputArgs, parse_range, parse_seconds},
-    frame_number,
     plot::{Line, Plot, Series},
     progress_bar, stop, write_whole,
 };
+use flyrig_takes::{AvatarTake, Replay, ReplaySettings, frame_number};
 use flyrig_types::{Camera, FrameSet, Image, Mask, Pose, RenderedView};
 use glam::DVec3;
 use serde::Serialize;

@@ -8,12 +8,11 @@ use flyrig_fusion::{BudgetSettings, Effort, Origin, Outcome, PersonId, Solver};
 use flyrig_gpu::GpuContext;
 use flyrig_metrics::{CameraScore, ScoreSheet, score_view};
 use flyrig_report::{
-    Replay,
     arguments::{GaussiansArgs, OutputArgs},
-    frame_number,
     plot::{Line, Plot, Series},
     progress_bar, stop, write_whole,
 };
+use flyrig_takes::{Replay, frame_number};
 use serde::Serialize;
 
 use crate::harness::arguments::RecordedArgs;

@@ -9,7 +9,8 @@ use clap::Args;
 use flyrig_body::load_gltf;
 use flyrig_capture::{FolderOptions, FolderReplay};
 use flyrig_fusion::next_frame;
-use flyrig_report::{arguments::FpsArgs, dataset, progress_bar};
+use flyrig_report::{arguments::FpsArgs, progress_bar};
+use flyrig_takes::dataset;
 use flyrig_tracker::{ConfidenceSpread, LANDMARK_NAMES, LandmarkStudy, PoseNet};
 
 /// Arguments of the command.

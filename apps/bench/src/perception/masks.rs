@@ -7,8 +7,9 @@ use clap::Args;
 use flyrig_body::{ShapeParams, default_template};
 use flyrig_capture::{FolderOptions, FolderReplay};
 use flyrig_fusion::SetReader;
-use flyrig_report::{arguments::FpsArgs, dataset, frame_number, png, progress_bar, write_whole};
+use flyrig_report::{arguments::FpsArgs, png, progress_bar, write_whole};
 use flyrig_sync::SyncSettings;
+use flyrig_takes::{dataset, frame_number};
 use flyrig_tracker::{PoseConfig, PoseNet, Viewers};
 use flyrig_types::Rig;
 
@@ -30,7 +31,7 @@ pub fn masks(args: &BenchMasksArgs) -> Result<()> {
     let template = default_template(&ShapeParams::default())?;
     for camera in &rig.cameras {
         let alone = Rig { cameras: vec![camera.clone()], world_up: rig.world_up };
-        let plates = dataset::plates(&args.dataset.join("background"), &alone)?;
+        let plates = dataset::load_plates(&args.dataset.join("background"), &alone)?;
         let mut viewers = Viewers::new(&PoseNet::embedded()?, &template, &alone, plates, &PoseConfig::default())?;
         let options = FolderOptions { fps: args.rate.fps, ..FolderOptions::default() };
         let sources = FolderReplay::open(&args.dataset, Some(std::slice::from_ref(&camera.id)), &options)?;

@@ -26,10 +26,10 @@ use flyrig_fusion::{BodySettings, Origin, Outcome, PerceptionSettings, PersonId,
 use flyrig_gpu::GpuContext;
 use flyrig_metrics::{CameraScore, ScoreSheet, score_view};
 use flyrig_report::{
-    Replay, ReplaySettings,
     arguments::{GaussiansArgs, OutputArgs},
-    dataset, progress_bar, write_whole,
+    progress_bar, write_whole,
 };
+use flyrig_takes::{Replay, ReplaySettings, dataset};
 use flyrig_tracker::PoseSettings;
 use flyrig_types::{Frame, FrameSet, Pose};
 use glam::DVec3;
@@ -168,7 +168,6 @@ fn run(args: &BenchPerceptionArgs, folder: &Path, inputs: Inputs, gpu: &GpuConte
     let body = BodySettings::with_gaussians(args.surface.gaussians);
     let settings = ReplaySettings {
         dataset: folder.to_owned(),
-        recorded: None,
         inputs: args.replay.inputs.clone(),
         holdout: if args.no_views { Vec::new() } else { args.replay.holdout.clone() },
         session: SessionSettings { perception, body, ..SessionSettings::default() },

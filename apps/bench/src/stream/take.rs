@@ -9,9 +9,10 @@ use anyhow::{Context, Result, ensure};
 use flyrig_fusion::{BudgetSettings, Origin, Outcome, PersonFrame, PersonId, Session};
 use flyrig_gpu::GpuContext;
 use flyrig_metrics::{ScoreSheet, score_view};
-use flyrig_report::{Replay, frame_number, known_body, progress_bar, stop};
+use flyrig_report::{progress_bar, stop};
 use flyrig_sim::{ExportOptions, MotionConfig, MotionKind, SimConfig, Simulator, export};
 use flyrig_stream::EncodedTemplate;
+use flyrig_takes::{Replay, frame_number, known_body};
 use flyrig_transport::SplatState;
 use flyrig_types::{Camera, Image, Mask, RenderedView};
 

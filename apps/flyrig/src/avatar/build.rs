@@ -7,14 +7,16 @@ use std::{
 
 use anyhow::{Context as _, Result, ensure};
 use clap::{Args, ValueEnum};
-use flyrig_avatar::{Avatar, AvatarScene, Bones, Card, Fit, FitSettings, LocalSettings};
+use flyrig_avatar::{Avatar, AvatarScene, Bones, Card, Fit, FitSettings, LocalSettings, TrainingFrame};
 use flyrig_body::DEFAULT_NODE_COUNT;
 use flyrig_fusion::BodySettings;
 use flyrig_gpu::GpuContext;
 use flyrig_renderer::HarmonicOrder;
-use flyrig_report::{AvatarTake, arguments::parse_minutes, png, progress_bar, stop};
+use flyrig_report::{arguments::parse_minutes, png, progress_bar, stop};
+use flyrig_takes::AvatarTake;
+use flyrig_types::Camera;
 
-use super::{checkpoint::Checkpoint, open_replay};
+use super::{checkpoint::Checkpoint, inputs::open_replay};
 use crate::arguments::DatasetArgs;
 
 /// Default number of Gaussians, about 7 mm apart on an adult.
@@ -85,49 +87,25 @@ fn parse_pull(text: &str) -> Result<f32, String> {
     }
 }
 
-/// Steps by which the time of one is measured.
+/// Number of steps from which the time of a step is measured.
 const MEASURED_STEPS: u64 = 20;
 /// Steps between updates of the progress.
 const SHOW_EVERY: u64 = 20;
-/// Steps, and time, between savings of the state.
+/// Steps and time between two checkpoints.
 const SAVE_STEPS: u64 = 500;
 const SAVE_EVERY: Duration = Duration::from_secs(30);
-/// Pictures that are written while it is fitted.
+/// Number of images written while the avatar is fitted.
 const PICTURES: u64 = 10;
 
 /// Runs the command.
 pub fn build(args: &AvatarBuildArgs, gpu: &GpuContext) -> Result<()> {
     let folder = args.out.parent().filter(|folder| !folder.as_os_str().is_empty()).unwrap_or(Path::new("."));
     ensure!(folder.is_dir(), "the folder {} does not exist; make it, or choose another --out", folder.display());
-    let started = Instant::now();
-    let body = BodySettings { gaussians: args.gaussians as usize, nodes: args.nodes, ..BodySettings::default() };
-    let mut replay = open_replay(&args.take, &[], (&body, None), gpu)?;
-    let order = match args.harmonics {
-        Order::Zero => HarmonicOrder::Zero,
-        Order::One => HarmonicOrder::One,
-        Order::Two => HarmonicOrder::Two,
-    };
-    let tracked = AvatarTake::track(&mut replay, &body, order, |_, _| Ok(()))
-        .with_context(|| format!("no avatar of {}", args.take.dataset.display()))?;
-    drop(replay);
-    let AvatarTake { frames, views, mut avatar, uvs, numbers, camera, .. } = tracked;
-    let tracked = started.elapsed();
-    println!(
-        "tracked {} frames in {:.0} s; fitting {} Gaussians to {} images on {}",
-        frames.len(),
-        tracked.as_secs_f64(),
-        avatar.gaussians(),
-        views.len(),
-        gpu.adapter_name()
-    );
+    let AvatarTake { frames, views, mut avatar, uvs, numbers, camera } = track(args, gpu)?;
     let first = frames.first().cloned().context("no frame")?;
-    let mut scene = AvatarScene::new(gpu, &avatar)?;
-    let picture_path = args.out.with_extension("png");
-    let mut picture = |avatar: &Avatar| -> Result<()> {
-        scene.pose(avatar, &Bones::new(&avatar.template.skeleton, &first.pose), Some(&first.translations));
-        png::write_view(&picture_path, &scene.draw(&camera)?)
-    };
-    picture(&avatar)?;
+    let scene = AvatarScene::new(gpu, &avatar)?;
+    let mut preview = Preview { scene, first, camera, path: args.out.with_extension("png") };
+    preview.draw(&avatar)?;
     let mut fit = Fit::new(
         gpu,
         &avatar,
@@ -139,75 +117,174 @@ pub fn build(args: &AvatarBuildArgs, gpu: &GpuContext) -> Result<()> {
     if args.method == Method::LogAvatar {
         let numbers = fit.use_networks(&mut avatar, &uvs, &local)?;
         println!("local networks of {numbers} numbers");
-        picture(&avatar)?;
+        preview.draw(&avatar)?;
     }
-    let state = Checkpoint::new(args, fit.images());
-    let (mut done, mut total) = (0, args.steps);
-    if let Some(progress) = state.resume(&mut fit, &mut avatar)? {
-        (done, total) = (progress.done, Some(progress.total));
-    }
-    let before = fit.decibels(&avatar)?;
-    let (fitting, resumed_at) = (Instant::now(), done);
-    let mut saved = (Instant::now(), done);
-    let bar = progress_bar(total.unwrap_or(MEASURED_STEPS), "avatar build");
-    bar.set_position(done);
-    let (mut sum, mut pictured) = (0.0, 0);
-    while total.is_none_or(|total| done < total) && !stop::requested() {
-        let progress = total.map_or(0.0, |total| done as f32 / total as f32);
-        sum += fit.step(&mut avatar, progress)?.decibels;
-        done += 1;
-        if total.is_none() && done == MEASURED_STEPS {
-            let step_secs = fitting.elapsed().as_secs_f64() / done as f64;
-            let all = ((args.minutes * 60.0 / step_secs) as u64).max(done);
-            bar.set_length(all);
-            total = Some(all);
-        }
-        if let Some(total) = total.filter(|_| done >= saved.1 + SAVE_STEPS || saved.0.elapsed() > SAVE_EVERY) {
-            state.save(&mut fit, &mut avatar, total)?;
-            saved = (Instant::now(), done);
-        }
-        if done % SHOW_EVERY == 0 {
-            bar.set_message(format!("{:.1} dB, {}", sum / SHOW_EVERY as f64, picture_path.display()));
-            bar.set_position(done);
-            sum = 0.0;
-        }
-        let tenth = total.map_or(0, |total| PICTURES * done / total);
-        if tenth > pictured {
-            pictured = tenth;
-            picture(&avatar)?;
-        }
-    }
-    bar.finish_and_clear();
-    if let Some(total) = total.filter(|total| done < *total) {
-        state.save(&mut fit, &mut avatar, total)?;
-        println!("stopped after {done} of {total} steps; the same command goes on from there");
-    }
-    let seconds = fitting.elapsed().as_secs_f64();
-    let training_db = fit.decibels(&avatar)?;
-    avatar.card = Card {
-        name: args.take.dataset.file_name().map_or_else(String::new, |name| name.to_string_lossy().into_owned()),
-        method: method(args.method, &local),
-        cameras: args.take.inputs.clone(),
-        frames: numbers,
-        pose: format!("{:?}", args.take.perception.pose).to_lowercase(),
-        masks: format!("{:?}", args.take.perception.masks).to_lowercase(),
-        steps: done,
-        seed: args.seed,
-        training_db,
-        edits: Vec::new(),
+    Building::start(args, fit, avatar, preview)?.run(numbers)
+}
+
+/// Tracks the person of the take.
+fn track(args: &AvatarBuildArgs, gpu: &GpuContext) -> Result<AvatarTake> {
+    let started = Instant::now();
+    let body = BodySettings { gaussians: args.gaussians as usize, nodes: args.nodes, ..BodySettings::default() };
+    let mut replay = open_replay(&args.take, &[], (&body, None), gpu)?;
+    let order = match args.harmonics {
+        Order::Zero => HarmonicOrder::Zero,
+        Order::One => HarmonicOrder::One,
+        Order::Two => HarmonicOrder::Two,
     };
-    avatar.save(&args.out)?;
-    if total.is_none_or(|total| done >= total) {
-        state.remove()?;
-    }
+    let take = AvatarTake::track(&mut replay, &body, order, |_, _| Ok(()))
+        .with_context(|| format!("no avatar of {}", args.take.dataset.display()))?;
     println!(
-        "{done} steps in {seconds:.0} s ({:.1} ms each); training images {before:.2} -> {training_db:.2} dB; {} ({:.1} MB) and {}",
-        1e3 * seconds / (done - resumed_at).max(1) as f64,
-        args.out.display(),
-        std::fs::metadata(&args.out).map_or(0.0, |file| file.len() as f64 / 1e6),
-        picture_path.display()
+        "tracked {} frames in {:.0} s; fitting {} Gaussians to {} images on {}",
+        take.frames.len(),
+        started.elapsed().as_secs_f64(),
+        take.avatar.gaussians(),
+        take.views.len(),
+        gpu.adapter_name()
     );
-    Ok(())
+    Ok(take)
+}
+
+/// Image of the avatar in the first pose, written while it is fitted.
+struct Preview {
+    scene: AvatarScene,
+    first: TrainingFrame,
+    camera: Camera,
+    path: PathBuf,
+}
+
+impl Preview {
+    fn draw(&mut self, avatar: &Avatar) -> Result<()> {
+        let bones = Bones::new(&avatar.template.skeleton, &self.first.pose);
+        self.scene.pose(avatar, &bones, Some(&self.first.translations));
+        png::write_view(&self.path, &self.scene.draw(&self.camera)?)
+    }
+}
+
+/// Avatar that is being fitted.
+struct Building<'a> {
+    args: &'a BuildArgs,
+    fit: Fit,
+    avatar: Avatar,
+    preview: Preview,
+    state: Checkpoint,
+    /// Number of steps so far.
+    done: u64,
+    /// Number of all steps; `None` until the time of a step has been measured.
+    total: Option<u64>,
+    started: Instant,
+    /// Number of steps before this run.
+    resumed_at: u64,
+    /// Mean PSNR of the training images before this run, dB.
+    before_db: f64,
+}
+
+impl<'a> Building<'a> {
+    /// Starts the fit, or resumes it from its checkpoint.
+    fn start(args: &'a BuildArgs, mut fit: Fit, mut avatar: Avatar, preview: Preview) -> Result<Self> {
+        let state = Checkpoint::new(args, fit.images());
+        let (done, total) = match state.resume(&mut fit, &mut avatar)? {
+            Some(progress) => (progress.done, Some(progress.total)),
+            None => (0, args.steps),
+        };
+        let before_db = fit.decibels(&avatar)?;
+        let started = Instant::now();
+        Ok(Self { args, fit, avatar, preview, state, done, total, started, resumed_at: done, before_db })
+    }
+
+    /// Fits until the last step or Ctrl-C, and writes the avatar. `numbers` are the take's first frame, and its last one plus 1.
+    fn run(mut self, numbers: [u64; 2]) -> Result<()> {
+        self.fit_until_end()?;
+        if let Some(total) = self.total.filter(|total| self.done < *total) {
+            self.state.save(&mut self.fit, &mut self.avatar, total)?;
+            println!("stopped after {} of {total} steps; the same command goes on from there", self.done);
+        }
+        let seconds = self.started.elapsed().as_secs_f64();
+        self.print_skipped();
+        let training_db = self.fit.decibels(&self.avatar)?;
+        self.avatar.card = self.card(numbers, training_db);
+        self.avatar.save(&self.args.out)?;
+        if self.total.is_none_or(|total| self.done >= total) {
+            self.state.remove()?;
+        }
+        println!(
+            "{} steps in {seconds:.0} s ({:.1} ms each); training images {:.2} -> {training_db:.2} dB; {} ({:.1} MB) and {}",
+            self.done,
+            1e3 * seconds / (self.done - self.resumed_at).max(1) as f64,
+            self.before_db,
+            self.args.out.display(),
+            std::fs::metadata(&self.args.out).map_or(0.0, |file| file.len() as f64 / 1e6),
+            self.preview.path.display()
+        );
+        Ok(())
+    }
+
+    fn fit_until_end(&mut self) -> Result<()> {
+        let mut saved = (Instant::now(), self.done);
+        let bar = progress_bar(self.total.unwrap_or(MEASURED_STEPS), "avatar build");
+        bar.set_position(self.done);
+        let (mut sum, mut pictured) = (0.0, 0);
+        while self.total.is_none_or(|total| self.done < total) && !stop::requested() {
+            let progress = self.total.map_or(0.0, |total| self.done as f32 / total as f32);
+            sum += self.fit.step(&mut self.avatar, progress)?.decibels;
+            self.done += 1;
+            if self.total.is_none() && self.done == MEASURED_STEPS {
+                let all = self.measured_total();
+                bar.set_length(all);
+                self.total = Some(all);
+            }
+            let is_due = self.done >= saved.1 + SAVE_STEPS || saved.0.elapsed() > SAVE_EVERY;
+            if let Some(total) = self.total.filter(|_| is_due) {
+                self.state.save(&mut self.fit, &mut self.avatar, total)?;
+                saved = (Instant::now(), self.done);
+            }
+            if self.done.is_multiple_of(SHOW_EVERY) {
+                bar.set_message(format!("{:.1} dB, {}", sum / SHOW_EVERY as f64, self.preview.path.display()));
+                bar.set_position(self.done);
+                sum = 0.0;
+            }
+            let tenth = self.total.map_or(0, |total| PICTURES * self.done / total);
+            if tenth > pictured {
+                pictured = tenth;
+                self.preview.draw(&self.avatar)?;
+            }
+        }
+        bar.finish_and_clear();
+        Ok(())
+    }
+
+    /// Returns the number of steps that fit into the minutes of the arguments.
+    fn measured_total(&self) -> u64 {
+        let step_secs = self.started.elapsed().as_secs_f64() / self.done as f64;
+        ((self.args.minutes * 60.0 / step_secs) as u64).max(self.done)
+    }
+
+    /// Prints which part of the images was skipped because its error had converged.
+    fn print_skipped(&self) {
+        let Drawn { images, left_out, rows: [rows, all] } = self.fit.drawn();
+        if left_out > 0 || rows < all {
+            println!(
+                "{images} images drawn and {left_out} left out, {:.0} % of the rows drawn, as their errors did not change",
+                100.0 * rows as f64 / all.max(1) as f64
+            );
+        }
+    }
+
+    fn card(&self, frames: [u64; 2], training_db: f64) -> Card {
+        let take = &self.args.take;
+        Card {
+            name: take.dataset.file_name().map_or_else(String::new, |name| name.to_string_lossy().into_owned()),
+            method: method(self.args),
+            cameras: take.inputs.clone(),
+            frames,
+            pose: format!("{:?}", take.perception.pose).to_lowercase(),
+            masks: format!("{:?}", take.perception.masks).to_lowercase(),
+            steps: self.done,
+            seed: self.args.seed,
+            training_db,
+            edits: Vec::new(),
+        }
+    }
 }
 
 /// Describes the method, for the card.

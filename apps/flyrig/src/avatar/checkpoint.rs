@@ -1,4 +1,4 @@
-//! The state of a build beside its avatar, from which the same command goes on after it was killed.
+//! Checkpoint of a build beside its avatar, from which the same command resumes after it was killed.
 
 use std::path::PathBuf;
 
@@ -8,23 +8,23 @@ use flyrig_report::write_whole;
 
 use super::build::AvatarBuildArgs;
 
-/// Ending of the file.
+/// Ending of the file's name.
 const ENDING: &str = "fit";
 
-/// File of a build's state.
+/// File with the state of a build.
 pub(super) struct Checkpoint {
     path: PathBuf,
-    /// Everything that the result depends on.
+    /// Description of everything that the result depends on.
     settings: String,
 }
 
 impl Checkpoint {
-    /// Beside the avatar that is built from so many images.
+    /// Returns the checkpoint beside the avatar that is built from this number of images.
     pub fn new(args: &AvatarBuildArgs, images: usize) -> Self {
         Self { path: args.out.with_extension(ENDING), settings: format!("{images} images, {args:?}") }
     }
 
-    /// Goes on from the file, if there is one of the same build; one of another build is left alone with a warning.
+    /// Resumes from the file if there is one of the same build; ignores that of another build with a warning.
     pub fn resume(&self, fit: &mut Fit, avatar: &mut Avatar) -> Result<Option<FitProgress>> {
         if !self.path.exists() {
             return Ok(None);
@@ -47,7 +47,7 @@ impl Checkpoint {
         write_whole(&self.path, &fit.checkpoint(avatar, &self.settings, total)?)
     }
 
-    /// Removes the file of a build that is done.
+    /// Removes the file of a finished build.
     pub fn remove(&self) -> Result<()> {
         match std::fs::remove_file(&self.path) {
             Err(error) if error.kind() != std::io::ErrorKind::NotFound => {

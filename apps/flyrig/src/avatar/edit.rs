@@ -1,4 +1,4 @@
-//! `flyrig avatar edit`: another texture, another shape.
+//! `flyrig avatar edit`: replaces texture or shape.
 
 use std::path::PathBuf;
 
@@ -8,7 +8,7 @@ use flyrig_body::ShapeParams;
 
 use super::{
     export::{TextureArgs, read_texture},
-    load,
+    inputs::load,
 };
 
 /// Arguments of `flyrig avatar edit`.

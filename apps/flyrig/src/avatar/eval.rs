@@ -1,4 +1,4 @@
-//! `flyrig avatar eval`: an avatar against held-out cameras.
+//! `flyrig avatar eval`: scores an avatar against held-out cameras.
 
 use std::{
     path::PathBuf,
@@ -11,10 +11,15 @@ use flyrig_avatar::{Avatar, DetailedScene};
 use flyrig_fusion::{BodySettings, Outcome, PersonId, Solver};
 use flyrig_gpu::GpuContext;
 use flyrig_metrics::{CameraScore, FrameScore, ScoreSheet, error_parts, score_view};
-use flyrig_report::{frame_number, png, progress_bar, write_whole};
+use flyrig_report::{png, progress_bar, write_whole};
+use flyrig_takes::{Replay, frame_number};
+use flyrig_types::{Camera, Frame, RenderedView};
 use serde::Serialize;
 
-use super::{load, open_replay, parts::score_parts, print_far};
+use super::{
+    inputs::{load, open_replay, print_far},
+    parts::score_parts,
+};
 use crate::arguments::{DatasetArgs, HoldoutArgs};
 
 /// Arguments of `flyrig avatar eval`.
@@ -41,17 +46,17 @@ struct Metrics<'a> {
     holdout: &'a [String],
     deformed: bool,
     gaussians: usize,
-    /// Gaussians of a view, after those that pixels do not tell apart were merged.
+    /// Mean number of Gaussians per view, after merging those that pixels do not resolve.
     mean_drawn: f64,
     adapter: String,
     mean: Option<CameraScore>,
     cameras: Vec<CameraScore>,
     per_frame: &'a [FrameScore],
-    /// Boxes around head and hands.
+    /// Scores of the boxes around head and hands.
     parts: Vec<CameraScore>,
-    /// Mean share of the Gaussians in poses unlike those of the take.
+    /// Mean fraction of the Gaussians in poses unlike those of the take.
     far_share: f64,
-    /// Mean time of posing and drawing a view, reading back included, milliseconds.
+    /// Mean time to pose and render a view, read-back included, milliseconds.
     view_ms: f64,
 }
 
@@ -65,91 +70,141 @@ pub fn eval(args: &AvatarEvalArgs, gpu: &GpuContext) -> Result<()> {
         take.tracking.solver = Solver::None;
     }
     let mut replay = open_replay(&take, &args.holdout.holdout, (&body, Some(&avatar.template)), gpu)?;
-    let holdout = replay.holdout.clone();
-    for camera in &holdout {
+    for camera in &replay.holdout {
         let folder = args.out.join(camera.id.as_str());
         std::fs::create_dir_all(&folder).with_context(|| format!("cannot create {}", folder.display()))?;
     }
-    let mut scene = DetailedScene::new(gpu, avatar, true)?;
-    let gaussians = scene.avatar().gaussians();
-    let bar = progress_bar(replay.count as u64, "avatar eval");
-    let (mut sheet, mut spent, mut views_drawn) = (ScoreSheet::default(), Duration::ZERO, 0u32);
-    // Gaussians of all views, and those among them that face away.
-    let (mut drawn, mut hidden) = (0, 0);
-    let (mut parts, mut far, mut frames) = (ScoreSheet::default(), 0.0, 0u32);
-    while let Some(set) = replay.next_set()? {
-        bar.inc(1);
-        let number = frame_number(&set);
-        if let Outcome::Held(reason) = replay.session.process(&set)? {
-            tracing::warn!(frame = number, %reason, "frame not used");
-        }
-        let subject = replay.session.subject(PersonId::default());
-        let Some((subject, pose)) = subject.and_then(|subject| Some((subject, subject.pose()?))) else { continue };
-        fits(scene.avatar(), &subject.template().skeleton, pose)?;
-        let start = Instant::now();
-        let deformed = Some(subject.node_translations()).filter(|all| args.deformed && !all.is_empty());
-        scene.pose(pose, deformed);
-        far += scene.avatar().far_share(pose);
-        frames += 1;
-        let mut views = Vec::new();
-        for camera in &holdout {
-            views.push(scene.draw(camera)?);
-            let (seen, away) = scene.drawn();
-            (drawn, hidden) = (drawn + seen, hidden + away);
-        }
-        spent += start.elapsed();
-        views_drawn += views.len() as u32;
-        let truths = replay.truth.at(set.master_nanos)?;
-        for ((camera, view), truth) in holdout.iter().zip(&views).zip(&truths) {
-            png::write_view(&args.out.join(camera.id.as_str()).join(format!("{number:06}.png")), view)?;
-            let Some(truth) = truth else { continue };
-            if let Some(mask) = &truth.mask {
-                parts.extend(score_parts((&scene, camera), number, view, &truth.image, mask)?);
-            }
-            let mut score = score_view(&camera.id, number, view, &truth.image, truth.mask.as_ref())?;
-            if let (Some(score), Some(mask)) = (&mut score, &truth.mask) {
-                score.parts = error_parts(view, &truth.image, mask)?;
-            }
-            sheet.extend(score);
-        }
-        bar.set_message(sheet.progress());
-    }
-    bar.finish_and_clear();
-    ensure!(views_drawn > 0, "nobody was found in {}; run with -v to see why", args.take.dataset.display());
-    let far_share = far / f64::from(frames.max(1));
-    let view_ms = 1e3 * spent.as_secs_f64() / f64::from(views_drawn);
-    let mean_drawn = drawn as f64 / f64::from(views_drawn);
-    let metrics = Metrics {
-        avatar: args.avatar.display().to_string(),
-        inputs: &args.take.inputs,
-        holdout: &args.holdout.holdout,
-        deformed: args.deformed,
-        gaussians,
-        mean_drawn,
-        adapter: gpu.adapter_name(),
-        mean: sheet.mean(),
-        cameras: sheet.per_camera(),
-        per_frame: sheet.frames(),
-        parts: parts.per_camera(),
-        far_share,
-        view_ms,
-    };
-    write_whole(&args.out.join("metrics.json"), &serde_json::to_vec_pretty(&metrics)?)?;
-    print!("{}", sheet.table());
-    for CameraScore { camera: part, frames, psnr_db, ssim, flip, .. } in parts.per_camera() {
-        println!("{part:<8} {frames:>6} {psnr_db:>9.2} {ssim:>8.4} {flip:>8.4}");
-    }
-    println!(
-        "\n{views_drawn} views of {mean_drawn:.0} of {gaussians} Gaussians, {:.0} % of them left out as they face away, {view_ms:.1} ms \
-         each; images in {}",
-        100.0 * hidden as f64 / drawn.max(1) as f64,
-        args.out.display()
-    );
-    print_far(far_share);
-    Ok(())
+    let scene = DetailedScene::new(gpu, avatar, true)?;
+    let mut evaluation =
+        Evaluation { args, scene, scores: ScoreSheet::default(), parts: ScoreSheet::default(), cost: Cost::default() };
+    evaluation.run(&mut replay)?;
+    evaluation.write(gpu)
 }
 
-/// Checks that a pose is one of the avatar's skeleton.
+/// Scores and cost of an avatar's views, collected frame by frame.
+struct Evaluation<'a> {
+    args: &'a EvalArgs,
+    scene: DetailedScene,
+    scores: ScoreSheet,
+    /// Scores of head and hands.
+    parts: ScoreSheet,
+    cost: Cost,
+}
+
+/// Sums over all frames.
+#[derive(Default)]
+struct Cost {
+    frames: u32,
+    views: u32,
+    /// Time to pose and render the views.
+    time: Duration,
+    /// Gaussians of all views, and those among them that face away.
+    gaussians: usize,
+    hidden: usize,
+    /// Fractions of the Gaussians in poses unlike those of the take.
+    far: f64,
+}
+
+impl Evaluation<'_> {
+    /// Renders and scores the avatar in the poses of all frame sets.
+    fn run(&mut self, replay: &mut Replay) -> Result<()> {
+        let bar = progress_bar(replay.count as u64, "avatar eval");
+        while let Some(set) = replay.next_set()? {
+            bar.inc(1);
+            let number = frame_number(&set);
+            if let Outcome::Held(reason) = replay.session.process(&set)? {
+                tracing::warn!(frame = number, %reason, "frame not used");
+            }
+            let Some(views) = self.render(replay)? else { continue };
+            let truths = replay.truth.at(set.master_nanos)?;
+            for ((camera, view), truth) in replay.holdout.iter().zip(&views).zip(&truths) {
+                self.score(number, camera, view, *truth)?;
+            }
+            bar.set_message(self.scores.progress());
+        }
+        bar.finish_and_clear();
+        let dataset = self.args.take.dataset.display();
+        ensure!(self.cost.views > 0, "no person was found in {dataset}; run with -v to see why");
+        Ok(())
+    }
+
+    /// Renders the held-out views in the pose of the last update; `None` without a person.
+    fn render(&mut self, replay: &Replay) -> Result<Option<Vec<RenderedView>>> {
+        let subject = replay.session.subject(PersonId::default());
+        let Some((subject, pose)) = subject.and_then(|subject| Some((subject, subject.pose()?))) else {
+            return Ok(None);
+        };
+        fits(self.scene.avatar(), &subject.template().skeleton, pose)?;
+        let start = Instant::now();
+        let deformed = Some(subject.node_translations()).filter(|all| self.args.deformed && !all.is_empty());
+        self.scene.pose(pose, deformed);
+        self.cost.far += self.scene.avatar().far_share(pose);
+        self.cost.frames += 1;
+        let mut views = Vec::new();
+        for camera in &replay.holdout {
+            views.push(self.scene.draw(camera)?);
+            let (gaussians, hidden) = self.scene.drawn();
+            self.cost.gaussians += gaussians;
+            self.cost.hidden += hidden;
+        }
+        self.cost.time += start.elapsed();
+        self.cost.views += views.len() as u32;
+        Ok(Some(views))
+    }
+
+    /// Writes a view and scores it against the held-out image, if there is one.
+    fn score(&mut self, number: u64, camera: &Camera, view: &RenderedView, truth: Option<&Frame>) -> Result<()> {
+        png::write_view(&self.args.out.join(camera.id.as_str()).join(format!("{number:06}.png")), view)?;
+        let Some(truth) = truth else { return Ok(()) };
+        if let Some(mask) = &truth.mask {
+            self.parts.extend(score_parts((&self.scene, camera), number, view, &truth.image, mask)?);
+        }
+        let mut score = score_view(&camera.id, number, view, &truth.image, truth.mask.as_ref())?;
+        if let (Some(score), Some(mask)) = (&mut score, &truth.mask) {
+            score.parts = error_parts(view, &truth.image, mask)?;
+        }
+        self.scores.extend(score);
+        Ok(())
+    }
+
+    /// Writes `metrics.json` and prints the scores.
+    fn write(&self, gpu: &GpuContext) -> Result<()> {
+        let Self { args, scores, parts, cost, .. } = self;
+        let metrics = Metrics {
+            avatar: args.avatar.display().to_string(),
+            inputs: &args.take.inputs,
+            holdout: &args.holdout,
+            deformed: args.deformed,
+            gaussians: self.scene.avatar().gaussians(),
+            mean_drawn: cost.gaussians as f64 / f64::from(cost.views),
+            adapter: gpu.adapter_name(),
+            mean: scores.mean(),
+            cameras: scores.per_camera(),
+            per_frame: scores.frames(),
+            parts: parts.per_camera(),
+            far_share: cost.far / f64::from(cost.frames.max(1)),
+            view_ms: 1e3 * cost.time.as_secs_f64() / f64::from(cost.views),
+        };
+        write_whole(&args.out.join("metrics.json"), &serde_json::to_vec_pretty(&metrics)?)?;
+        print!("{}", scores.table());
+        for CameraScore { camera: part, frames, psnr_db, ssim, flip, .. } in parts.per_camera() {
+            println!("{part:<8} {frames:>6} {psnr_db:>9.2} {ssim:>8.4} {flip:>8.4}");
+        }
+        println!(
+            "\n{} views of {:.0} of {} Gaussians, {:.0} % of them left out as they face away, {:.1} ms each; images in {}",
+            cost.views,
+            metrics.mean_drawn,
+            metrics.gaussians,
+            100.0 * cost.hidden as f64 / cost.gaussians.max(1) as f64,
+            metrics.view_ms,
+            args.out.display()
+        );
+        print_far(metrics.far_share);
+        Ok(())
+    }
+}
+
+/// Checks that a pose fits the avatar's skeleton.
 fn fits(avatar: &Avatar, skeleton: &flyrig_body::Skeleton, pose: &flyrig_types::Pose) -> Result<()> {
     let names = |skeleton: &flyrig_body::Skeleton| -> Vec<String> {
         skeleton.joints().iter().map(|joint| joint.name.clone()).collect()

@@ -1,4 +1,4 @@
-//! `flyrig avatar export`: an avatar for other programs.
+//! `flyrig avatar export`: writes an avatar for other programs.
 
 use std::path::{Path, PathBuf};
 
@@ -12,7 +12,7 @@ use flyrig_types::PoseTrack;
 use glam::{DQuat, Quat};
 
 use super::{
-    load,
+    inputs::load,
     render::{motion, pose_at},
 };
 
@@ -88,7 +88,7 @@ fn mesh(avatar: &Avatar, args: &AvatarExportArgs) -> Result<()> {
     Ok(())
 }
 
-/// Turns a motion, which has z up, to glTF's y.
+/// Rotates a motion from z up to glTF's y up.
 fn y_up(track: &PoseTrack) -> Result<PoseTrack> {
     let turn = DQuat::from_rotation_x(-std::f64::consts::FRAC_PI_2);
     let turned = track.keys().iter().map(|(nanos, pose)| {
@@ -119,7 +119,7 @@ fn splats(avatar: &Avatar, args: &AvatarExportArgs, ending: &str) -> Result<()> 
     let count = if ending == "ply" {
         write_anisotropic_ply(&args.out, &splats)?
     } else {
-        // Motions have z up, the body at rest y.
+        // Motions have z up, the rest pose has y up.
         let turn = if args.motion.is_some() { -std::f32::consts::FRAC_PI_2 } else { 0.0 };
         write_splat_glb(&args.out, &splats, Quat::from_rotation_x(turn))?
     };
@@ -127,7 +127,7 @@ fn splats(avatar: &Avatar, args: &AvatarExportArgs, ending: &str) -> Result<()> 
     Ok(())
 }
 
-/// Reads an edited texture, which must have `side` texels a side.
+/// Reads an edited texture, which must have `side` x `side` texels.
 pub(super) fn read_texture(path: &Path, side: u32) -> Result<Atlas> {
     let image = image::open(path).with_context(|| format!("cannot read the texture {}", path.display()))?.into_rgb8();
     let (width, height) = image.dimensions();

@@ -1,4 +1,4 @@
-//! Head and hands scored by themselves: they are small, and looked at first.
+//! Separate scores of head and hands, which are small but draw the eye.
 
 use anyhow::Result;
 use flyrig_avatar::DetailedScene;
@@ -6,12 +6,12 @@ use flyrig_body::Part;
 use flyrig_metrics::{FrameScore, score_view};
 use flyrig_types::{Camera, Image, Mask, RenderedView};
 
-/// Pixels around the Gaussians' centres that still belong to a part.
+/// Margin around the centres of a part's Gaussians, pixels.
 const MARGIN_PX: f64 = 3.0;
-/// Parts by themselves; both hands go into one row.
+/// Separately scored parts; both hands share a row.
 const PARTS: [(&str, Part); 3] = [("head", Part::Head), ("hands", Part::LeftHand), ("hands", Part::RightHand)];
 
-/// Scores the boxes around head and hands of a view; their names are in place of the camera's.
+/// Scores the boxes around head and hands of a view, with their names in place of the camera's.
 pub(super) fn score_parts(
     (scene, camera): (&DetailedScene, &Camera),
     frame: u64,
@@ -29,7 +29,7 @@ pub(super) fn score_parts(
     Ok(scores)
 }
 
-/// Zeroes everything outside of a box, in an image of so many channels.
+/// Zeroes the pixels outside a box, in an image with this number of channels.
 fn cut(bytes: &[u8], width: u32, channels: usize, [x0, y0, x1, y1]: [u32; 4]) -> Vec<u8> {
     let mut kept = vec![0; bytes.len()];
     let row = (width as usize * channels).max(1);

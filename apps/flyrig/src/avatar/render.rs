@@ -1,4 +1,4 @@
-//! `flyrig avatar render`: an avatar driven by a recorded motion.
+//! `flyrig avatar render`: renders an avatar driven by a recorded motion.
 
 use std::{
     ops::Range,
@@ -17,7 +17,7 @@ use flyrig_report::{
 use flyrig_types::{Camera, Intrinsics, Isometry, Lens, Pose, PoseTrack};
 use glam::{DQuat, DVec2, DVec3};
 
-use super::{load, print_far};
+use super::inputs::{load, print_far};
 
 /// Arguments of `flyrig avatar render`.
 #[derive(Debug, Args)]
@@ -38,9 +38,9 @@ pub struct AvatarRenderArgs {
     pub size: [u32; 2],
 }
 
-/// Frames a second of the images.
+/// Frame rate of the images, frames per second.
 pub(super) const FPS: f64 = 30.0;
-/// Where the camera stands from the person, metres, and how high.
+/// Distance and height of the camera, metres.
 const AWAY_M: f64 = 3.6;
 const HEIGHT_M: f64 = 1.1;
 
@@ -72,7 +72,7 @@ pub fn render(args: &AvatarRenderArgs, gpu: &GpuContext) -> Result<()> {
     Ok(())
 }
 
-/// Brings a recorded motion onto the avatar's skeleton.
+/// Retargets a recorded motion to the avatar's skeleton.
 pub(super) fn motion(avatar: &Avatar, path: &Path) -> Result<PoseTrack> {
     let ending = path.extension().map(|ending| ending.to_string_lossy().to_lowercase()).unwrap_or_default();
     let clip = match ending.as_str() {
@@ -84,16 +84,16 @@ pub(super) fn motion(avatar: &Avatar, path: &Path) -> Result<PoseTrack> {
     Ok(clip.retarget(&avatar.template.skeleton, &options)?)
 }
 
-/// The pose of a frame.
+/// Returns the pose of a frame.
 pub(super) fn pose_at(track: &PoseTrack, frame: u64) -> Pose {
     track.at((frame as f64 / FPS * 1e9) as i64)
 }
 
-/// A camera before the person, at its height.
+/// Returns a camera in front of the person.
 fn camera([width, height]: [u32; 2], root: DVec3) -> Camera {
     let focal = 1.4 * f64::from(height);
     let place = DVec3::new(root.x, root.y - AWAY_M, HEIGHT_M);
-    // The world's z is up; a camera looks along its own z, with y down.
+    // The world has z up; a camera looks along its own z, with y down.
     let camera_from_world = DQuat::from_rotation_x(std::f64::consts::FRAC_PI_2);
     Camera {
         id: "view".into(),

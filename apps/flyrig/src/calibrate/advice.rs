@@ -1,15 +1,17 @@
-//! The next step of a calibration under way: which boards are missing.
+//! Next step of a calibration under way: the boards that are missing.
 
 use flyrig_calib::{BoardShot, BoardView, CalibError, RigFit};
 use flyrig_types::CameraId;
 use glam::DVec2;
 
-use super::page::{CELLS, WELL_LINKED};
-
-/// Different boards that a lens needs, and share of the image's cells in which corners must have been seen.
+/// Shared boards from which on two cameras are well linked.
+pub(super) const WELL_LINKED: usize = 12;
+/// Columns and rows of the cells of an image in which corners are counted.
+pub(super) const CELLS: [usize; 2] = [8, 6];
+/// Number of different boards that a lens needs, and fraction of the image's cells that need corners.
 const LENS_BOARDS: usize = 10;
 const COVERED: f64 = 0.6;
-/// A board counts as another one where its corners have moved by this share of the image's width.
+/// Movement of the corners, as a fraction of the image's width, beyond which a board is a different one.
 const MOVED: f64 = 0.03;
 /// Parts of an image, by row and column.
 const PARTS: [[&str; 3]; 3] = [
@@ -19,9 +21,9 @@ const PARTS: [[&str; 3]; 3] = [
 ];
 
 /// State of a calibration under way.
-pub struct Progress<'a> {
+pub struct CalibrationState<'a> {
     pub ids: &'a [CameraId],
-    /// By camera, pixels; `None` for one without an image.
+    /// Width and height of each camera's images, pixels; `None` without an image.
     pub sizes: &'a [Option<[u32; 2]>],
     /// Different boards, see [`different`].
     pub shots: &'a [BoardShot],
@@ -33,10 +35,10 @@ pub struct Progress<'a> {
     pub target_mm: f64,
 }
 
-/// Next step of whoever holds the board. Cameras are given by slot.
+/// Next step of the person with the board. Cameras are given by slot.
 #[derive(Debug, Clone, PartialEq)]
 pub enum Step {
-    /// A camera gives no image.
+    /// A camera delivers no image.
     NoImage(usize),
     /// A camera has not seen the board.
     NoBoard(usize),
@@ -46,20 +48,20 @@ pub enum Step {
     Cover { camera: usize, covered: f64, part: &'static str },
     /// All boards of a camera face it.
     Tilt(usize),
-    /// Too few boards join two groups of cameras; these two are the nearest to it.
+    /// Too few boards link two groups of cameras; these two cameras share the most.
     Link { cameras: (usize, usize), shared: usize },
-    /// Boards leave the poses open.
+    /// The boards do not determine the poses.
     More,
-    /// A camera is not known well enough; the other one shares most boards with it.
+    /// The pose of a camera is too uncertain; `with` shares the most boards with it.
     Sharpen { camera: usize, with: usize, mm: f64 },
     /// A solve is under way.
     Wait,
-    /// Every camera is known to this, millimetres.
+    /// Every camera's position is known to this deviation, millimetres.
     Done(f64),
 }
 
-impl Progress<'_> {
-    /// Returns the first thing that is missing.
+impl CalibrationState<'_> {
+    /// Returns the first missing step.
     pub fn next(&self) -> Step {
         let slots = || 0..self.ids.len();
         if let Some(slot) = slots().find(|&slot| self.sizes[slot].is_none()) {
@@ -92,7 +94,7 @@ impl Progress<'_> {
 
     fn sharpen(&self, fit: &RigFit) -> Step {
         let mm = |slot: usize| match (slot, &fit.cameras[slot].uncertainty) {
-            // The others are measured against it.
+            // The reference of all others.
             (0, _) => 0.0,
             (_, Some(uncertainty)) => uncertainty.middle_mm,
             (_, None) => f64::INFINITY,
@@ -108,7 +110,7 @@ impl Progress<'_> {
         }
     }
 
-    /// Boards that a camera saw.
+    /// Returns the number of boards that a camera saw.
     pub fn boards(&self, slot: usize) -> usize {
         self.views(slot).count()
     }
@@ -117,7 +119,7 @@ impl Progress<'_> {
         self.shots.iter().filter_map(move |shot| view_of(shot, slot))
     }
 
-    /// Formats how well a camera's place is known.
+    /// Formats the deviation of a camera's position, millimetres.
     pub fn known(&self, slot: usize) -> String {
         match self.solved {
             Some(Ok(_)) if slot == 0 => "reference".to_owned(),
@@ -129,23 +131,23 @@ impl Progress<'_> {
         }
     }
 
-    /// Corners that a camera saw, pixels.
+    /// Returns the corners that a camera saw, pixels.
     pub fn corners(&self, slot: usize) -> Vec<DVec2> {
         self.views(slot).flat_map(|view| &view.corners).map(|corner| corner.pixel).collect()
     }
 
-    /// Boards that two cameras saw together.
+    /// Returns the number of boards that two cameras saw together.
     pub fn shared(&self, a: usize, b: usize) -> usize {
         self.shots.iter().filter(|shot| view_of(shot, a).is_some() && view_of(shot, b).is_some()).count()
     }
 
-    /// Share of the cells of a camera's image in which corners were seen.
+    /// Returns the fraction of the cells of a camera's image that have corners, 0..=1.
     pub fn covered(&self, slot: usize) -> f64 {
         let cells = self.cells(slot, CELLS);
         cells.iter().filter(|count| **count > 0).count() as f64 / cells.len() as f64
     }
 
-    /// Corners in each cell of a camera's image, row by row.
+    /// Counts the corners in each cell of a camera's image, row by row.
     fn cells(&self, slot: usize, [columns, rows]: [usize; 2]) -> Vec<usize> {
         let mut cells = vec![0; columns * rows];
         let Some(size) = self.sizes[slot].map(|[w, h]| DVec2::new(w.into(), h.into())) else { return cells };
@@ -158,7 +160,7 @@ impl Progress<'_> {
         cells
     }
 
-    /// Returns the part of a camera's image in which most small cells have no corner.
+    /// Returns the part of a camera's image with the most empty cells.
     fn emptiest_part(&self, slot: usize) -> &'static str {
         let mut empty = [[0; 3]; 3];
         for (at, _) in
@@ -171,7 +173,7 @@ impl Progress<'_> {
         parts.max_by_key(|&(row, column)| empty[row][column]).map_or("at the edges", |(row, column)| PARTS[row][column])
     }
 
-    /// Joins cameras by their strongest pairs; the pair at which too few boards are shared.
+    /// Links the cameras by their strongest pairs, and returns the pair that shares too few boards, if any.
     fn weakest_link(&self) -> Option<Step> {
         let mut joined = vec![0];
         while joined.len() < self.ids.len() {
@@ -189,7 +191,7 @@ impl Progress<'_> {
 }
 
 impl Step {
-    /// Returns the sentence for whoever holds the board.
+    /// Returns the instruction for the person with the board.
     pub fn sentence(&self, ids: &[CameraId], target_mm: f64) -> String {
         match *self {
             Self::NoImage(slot) => {
@@ -229,7 +231,7 @@ fn view_of(shot: &BoardShot, slot: usize) -> Option<&BoardView> {
     shot.views.iter().find(|view| view.camera == slot)
 }
 
-/// Appends the shots from `from` on whose board has moved since the last one that the same camera saw.
+/// Appends to `kept` the shots after `from` whose board has moved since the last kept one of the same camera.
 pub fn different(shots: &[BoardShot], from: usize, sizes: &[Option<[u32; 2]>], kept: &mut Vec<BoardShot>) {
     for shot in shots.iter().skip(from) {
         let is_new = |view: &BoardView| {
@@ -260,7 +262,7 @@ mod tests {
         (0..count).map(|slot| CameraId::from(format!("{slot:02}"))).collect()
     }
 
-    /// A board of 24 corners, 100 pixels wide, at a place of the cameras' images.
+    /// Returns a shot of a board with 24 corners, 100 pixels wide, at a position in the cameras' images.
     fn shot(cameras: &[usize], at: [f64; 2]) -> BoardShot {
         let corner = |index: usize| SeenCorner {
             index,
@@ -270,7 +272,7 @@ mod tests {
         BoardShot { nanos: 0, views: cameras.iter().map(view).collect() }
     }
 
-    /// Boards all over the images of some cameras.
+    /// Returns shots of boards all over the images of some cameras.
     fn everywhere(cameras: &[usize]) -> Vec<BoardShot> {
         let at = |i: usize| [(i % 6) as f64 * 105.0, (i / 6) as f64 * 95.0];
         (0..30).map(|i| shot(cameras, at(i))).collect()
@@ -282,7 +284,7 @@ mod tests {
         solved: Option<&Result<RigFit, CalibError>>,
     ) -> (Step, String) {
         let ids = ids(sizes.len());
-        let progress = Progress { ids: &ids, sizes, shots, with_lenses: true, solved, target_mm: 2.0 };
+        let progress = CalibrationState { ids: &ids, sizes, shots, with_lenses: true, solved, target_mm: 2.0 };
         let step = progress.next();
         let sentence = step.sentence(&ids, 2.0);
         (step, sentence)
@@ -296,7 +298,7 @@ mod tests {
         let (step, sentence) = next(&[shot(&[0, 1, 2], [0.0; 2])], &sizes, None);
         assert_eq!(step, Step::MoreBoards { camera: 0, boards: 1 });
         assert!(sentence.contains("camera 00 has seen 1 of 10 boards"), "{sentence}");
-        // Camera 2 saw boards at the left alone.
+        // Camera 2 saw boards only at the left.
         let mut shots = everywhere(&[0, 1]);
         shots.extend((0..12).map(|i| shot(&[2], [0.0, f64::from(i) * 33.0])));
         let (step, sentence) = next(&shots, &sizes, None);
@@ -307,7 +309,7 @@ mod tests {
             ),
             "{sentence}"
         );
-        // 0 and 1 are joined, 2 shares three boards with 1.
+        // Cameras 0 and 1 are linked, 2 shares three boards with 1.
         let mut shots = everywhere(&[0, 1]);
         shots.extend(everywhere(&[2]));
         shots.extend((0..3).map(|i| shot(&[1, 2], [f64::from(i) * 100.0, 50.0])));

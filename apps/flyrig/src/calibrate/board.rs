@@ -5,7 +5,7 @@ use clap::{Args, ValueEnum};
 use flyrig_calib::{Board, BoardSheet, Pattern};
 use flyrig_report::write_whole;
 
-use super::refuse_existing;
+use super::output::refuse_existing;
 use crate::arguments::TargetArgs;
 
 /// Arguments of `flyrig calibrate board`.

@@ -1,4 +1,4 @@
-//! `flyrig calibrate color`: colours of the cameras, matched by people whom several of them see.
+//! `flyrig calibrate color`: matches the cameras' colours on people whom several of them see.
 
 use anyhow::{Context as _, Result, ensure};
 use clap::Args;
@@ -10,14 +10,15 @@ use flyrig_fusion::{
 };
 use flyrig_gpu::GpuContext;
 use flyrig_report::{stop, write_whole};
+use flyrig_takes::{Calibration, Take, TakeOptions, TakeSpan};
 use flyrig_types::{CameraId, ColorMatch, FrameSet, Rig};
 use glam::DVec2;
 use serde_json::json;
 
-use super::{FILES, refuse_existing};
+use super::output::{FILES, refuse_existing};
 use crate::{
     arguments::{CalibrationArgs, InputArgs, SpanArgs, TargetArgs},
-    take::{self, CalibratedTake},
+    opening::open_take,
 };
 
 /// Arguments of `flyrig calibrate color`.
@@ -37,37 +38,37 @@ pub struct CalibrateColorArgs {
     pub target: TargetArgs,
 }
 
-/// Gaussians on a person: enough for colours, in a quarter of the time.
+/// Number of Gaussians per person: enough for colours, in a quarter of the time.
 const GAUSSIANS: usize = 30_000;
-/// Points that are taken of a person and a set.
+/// Number of points per person and frame set.
 const POINTS: usize = 2000;
-/// Sets from one whose colours are taken to the next.
+/// Frame sets from one whose colours are sampled to the next.
 const EVERY: u64 = 4;
-/// Weight of the angle (Eq. 7), and nearness to the drawn surface exp(-k d), that a point needs in a view.
+/// Least weight of the viewing angle (Eq. 7) and least proximity exp(-k d) to the rendered surface of a point in a view.
 const LEAST_WEIGHT: f32 = 0.1;
 const LEAST_NEARNESS: f32 = 0.85;
-/// A surface is looked at within a square that reaches this share of the image's width to each side.
+/// Image width over half the side of the square that a colour is averaged in.
 const REACH: u32 = 200;
-/// Range of sRGB values there, as a share of their mean, at which a sample counts half; and beyond which it is not used.
+/// Range of sRGB values in the square, relative to their mean, at which a sample's weight is halved, and beyond which it is 0.
 const EVEN: (f64, f64) = (0.05, 0.5);
-/// Differences between cameras that are not worth a correction.
+/// Largest relative difference between cameras that needs no correction.
 const MATCHED: f64 = 0.02;
-/// Gains of the halves of a take may differ by this share.
+/// Largest relative difference between the gains of the halves of a take.
 const MOST_HALVES: f64 = 0.03;
 
 /// Runs the command.
 pub fn color(args: &CalibrateColorArgs, gpu: &dyn Fn() -> Result<GpuContext>) -> Result<()> {
     stop::flag();
     refuse_existing(&args.target.out, &FILES, args.target.force)?;
-    let open = || {
-        take::open_calibrated(&args.source.input, args.source.rate.fps, args.calibration.calibration.as_deref(), gpu)
-    };
+    let calibration = args.calibration.calibration.as_deref();
+    let options = TakeOptions { fps: args.source.rate.fps, calibration, ..TakeOptions::default() };
+    let open = || open_take(&args.source.input, &options, gpu);
     let mut take = open()?;
     ensure!(
         !take.is_live,
-        "live cameras cannot be looked at frame by frame; record them first (flyrig record) and give the recording"
+        "live cameras cannot be processed frame by frame; record them first (flyrig record) and give the recording"
     );
-    let (mut rig, plates) = take
+    let Calibration { mut rig, plates } = take
         .calibration
         .take()
         .context("no calibration: name its folder with --calibration; flyrig calibrate rig makes one from a board")?;
@@ -84,14 +85,14 @@ pub fn color(args: &CalibrateColorArgs, gpu: &dyn Fn() -> Result<GpuContext>) ->
     settings.body.gaussians = GAUSSIANS;
     settings.validate()?;
     let mut estimated = EstimatedPerception::new(&rig, &template, &settings.perception, &plates)?;
-    // Somebody who comes later is measured then.
+    // People who come later are measured then.
     if let Err(error) = estimated.learn_shapes(&first_sets(args, &rig, open()?)?) {
-        tracing::debug!(%error, "nobody in the first sets");
+        tracing::debug!(%error, "no person in the first frame sets");
     }
     let mut session = SessionBuilder::new(gpu()?, rig.clone()).settings(settings).perception(estimated).build()?;
     session.keep_observations()?;
-    let points = look_through(args, &rig, &mut session, take)?;
-    ensure!(!points.is_empty(), "nobody is followed; let one person walk where all cameras see them whole");
+    let points = sample_colors(args, &rig, &mut session, take)?;
+    ensure!(!points.is_empty(), "no person is tracked; let one person walk where all cameras see them whole");
     let ids: Vec<CameraId> = rig.cameras.iter().map(|camera| camera.id.clone()).collect();
     let fit = match_colors(&ids, &points)?;
     for (camera, solved) in rig.cameras.iter_mut().zip(&fit.cameras) {
@@ -108,11 +109,11 @@ pub fn color(args: &CalibrateColorArgs, gpu: &dyn Fn() -> Result<GpuContext>) ->
     Ok(())
 }
 
-/// Returns sets of the first seconds, from which shapes are measured.
-fn first_sets(args: &CalibrateColorArgs, rig: &Rig, take: CalibratedTake) -> Result<Vec<FrameSet>> {
+/// Reads frame sets of the first seconds, from which shapes are estimated.
+fn first_sets(args: &CalibrateColorArgs, rig: &Rig, take: Take) -> Result<Vec<FrameSet>> {
     let secs = [args.span.from_secs, args.span.from_secs + SHAPE_SECS];
     let (mut sets, mut first): (Vec<FrameSet>, _) = (Vec::new(), None);
-    take::each_set(take.sources, rig, take.sync, 0, secs, "the person's shape, ms of the take", |set| {
+    take.for_each_set(rig, TakeSpan { secs, spread_nanos: 0 }, "the person's shape, ms of the take", |set| {
         let from = *first.get_or_insert(set.master_nanos);
         let due = SHAPE_SECS * sets.len() as f64 / SHAPE_SETS as f64;
         if set.master_nanos.saturating_sub(from) as f64 * 1e-9 >= due - 1e-3 {
@@ -123,16 +124,11 @@ fn first_sets(args: &CalibrateColorArgs, rig: &Rig, take: CalibratedTake) -> Res
     Ok(sets)
 }
 
-/// Follows people through the take and collects what cameras see of their surfaces.
-fn look_through(
-    args: &CalibrateColorArgs,
-    rig: &Rig,
-    session: &mut Session,
-    take: CalibratedTake,
-) -> Result<Vec<ColorPoint>> {
+/// Tracks people through the take and samples the colours of their surfaces.
+fn sample_colors(args: &CalibrateColorArgs, rig: &Rig, session: &mut Session, take: Take) -> Result<Vec<ColorPoint>> {
     let secs = [args.span.from_secs, args.span.from_secs + args.span.secs];
     let (mut points, mut sets) = (Vec::new(), 0u64);
-    let errors = take::each_set(take.sources, rig, take.sync, 0, secs, "colours, ms of the take", |set| {
+    let errors = take.for_each_set(rig, TakeSpan { secs, spread_nanos: 0 }, "colours, ms of the take", |set| {
         session.process(set)?;
         sets += 1;
         if !sets.is_multiple_of(EVERY) {
@@ -147,14 +143,14 @@ fn look_through(
         Ok(())
     })?;
     for (slot, camera) in rig.cameras.iter().enumerate() {
-        if let Some(error) = errors.of(slot) {
+        if let Some(error) = errors.get(slot) {
             eprintln!("warning: not every image of camera {} could be used; the last: {error}", camera.id);
         }
     }
     Ok(points)
 }
 
-/// Takes the points that two views or more see well.
+/// Samples the points that at least two views see well.
 fn seen(rig: &Rig, observed: &Observed, instant: u64) -> Vec<ColorPoint> {
     let views = &observed.observations.views;
     let count = observed.center_scale.len();
@@ -176,12 +172,12 @@ fn seen(rig: &Rig, observed: &Observed, instant: u64) -> Vec<ColorPoint> {
     };
     let all: Vec<ColorPoint> = (0..count).filter_map(point).collect();
     let step = all.len().div_ceil(POINTS).max(1);
-    // Others each time.
+    // Different points each time.
     all.into_iter().skip(instant as usize % step).step_by(step).collect()
 }
 
-/// Returns the mean sRGB values around a pixel of an image with the mask as alpha, and how much they count, 0 to 1: where the surface is
-/// patterned, a small error of its place is one of its colour. `None` at the mask's edge and outside.
+/// Returns the mean sRGB values around a pixel of an image with the mask as alpha, and their weight, 0 to 1: on a patterned surface,
+/// a small position error is a colour error. `None` at the mask's edge and outside.
 fn srgb_at([width, height]: [u32; 2], rgba: &[u8], [x, y]: [f32; 2]) -> Option<([f64; 3], f64)> {
     let reach = i64::from(width / REACH).max(1);
     let (x, y) = (x.round() as i64, y.round() as i64);
@@ -204,7 +200,7 @@ fn srgb_at([width, height]: [u32; 2], rgba: &[u8], [x, y]: [f32; 2]) -> Option<(
     let count = (2 * reach + 1).pow(2) as f64;
     let mean: [f64; 3] = sums.map(|sum| f64::from(sum) / (255.0 * count));
     let range = (0..3).map(|k| f64::from(most[k] - least[k]) / (255.0 * mean[k])).fold(0.0, f64::max);
-    // NaN, of black, is not below.
+    // Black gives NaN, which does not compare below.
     (range < EVEN.1).then(|| (mean, 1.0 / (1.0 + (range / EVEN.0).powi(2))))
 }
 

@@ -8,7 +8,7 @@ use flyrig_calib::{Format, save_lenses};
 use flyrig_capture::folder_image_size;
 use flyrig_types::ColorMatch;
 
-use super::refuse_existing;
+use super::output::refuse_existing;
 use crate::arguments::TargetArgs;
 
 /// Arguments of `flyrig calibrate convert`.
@@ -106,7 +106,7 @@ pub fn convert(args: &CalibrateConvertArgs) -> Result<()> {
     if args.to != Format::Flyrig && rig.cameras.iter().any(|camera| camera.color != ColorMatch::NONE) {
         println!("warning: {} has no place for colour corrections; they are left out", args.to.name());
     }
-    // A folder that stays empty goes again.
+    // A folder that stays empty is removed again.
     let files = args.to.write(&args.target.out, &rig).inspect_err(|_| drop(std::fs::remove_dir(&args.target.out)))?;
     println!("{}: {}", args.target.out.display(), files.join(", "));
     Ok(())

@@ -1,4 +1,4 @@
-//! `flyrig calibrate lens`: the lenses of cameras, each by itself.
+//! `flyrig calibrate lens`: calibrates the lens of each camera separately.
 
 use anyhow::{Context as _, Result};
 use clap::Args;
@@ -8,8 +8,8 @@ use flyrig_report::stop;
 use flyrig_types::{CameraId, Intrinsics};
 
 use super::{
-    refuse_existing,
-    views::{Seen, TakeArgs},
+    output::refuse_existing,
+    views::{BoardTakeArgs, SeenBoards},
 };
 use crate::arguments::{BoardArgs, TargetArgs};
 
@@ -17,14 +17,14 @@ use crate::arguments::{BoardArgs, TargetArgs};
 #[derive(Debug, Args)]
 pub struct CalibrateLensArgs {
     #[command(flatten)]
-    pub take: TakeArgs,
+    pub take: BoardTakeArgs,
     #[command(flatten)]
     pub board: BoardArgs,
     #[command(flatten)]
     pub target: TargetArgs,
 }
 
-/// Coverage below which edges of the image are guesses.
+/// Least coverage of an image, 0..=1: below it the lens is extrapolated at the edges.
 const GOOD_COVERAGE: f64 = 0.6;
 
 /// Runs the command.
@@ -32,7 +32,7 @@ pub fn lens(args: &CalibrateLensArgs, gpu: &dyn Fn() -> Result<GpuContext>) -> R
     stop::flag();
     let board = Board::load(&args.board.board)?;
     refuse_existing(&args.target.out, &["calibration.toml"], args.target.force)?;
-    let seen = Seen::find(&args.take, &board, gpu)?;
+    let seen = SeenBoards::find(&args.take, &board, gpu)?;
     let lenses = solve(&board, &seen)?;
     std::fs::create_dir_all(&args.target.out)
         .with_context(|| format!("cannot create {}", args.target.out.display()))?;
@@ -42,8 +42,8 @@ pub fn lens(args: &CalibrateLensArgs, gpu: &dyn Fn() -> Result<GpuContext>) -> R
     Ok(())
 }
 
-/// Calibrates the lens of every camera and prints how well.
-pub fn solve(board: &Board, seen: &Seen) -> Result<Vec<(CameraId, Intrinsics)>> {
+/// Calibrates the lens of every camera and prints the residuals.
+pub fn solve(board: &Board, seen: &SeenBoards) -> Result<Vec<(CameraId, Intrinsics)>> {
     let mut lenses = Vec::new();
     println!(
         "{:<14} {:>6} {:>7} {:>9} {:>18} {:>16} {:>9}  lens",
@@ -71,7 +71,7 @@ pub fn solve(board: &Board, seen: &Seen) -> Result<Vec<(CameraId, Intrinsics)>> 
     Ok(lenses)
 }
 
-/// The model, and the error of views that were kept out for each.
+/// Formats the lens model, and the error of each model on held-out views.
 fn model(fit: &LensFit) -> String {
     let errors: Vec<String> = fit.held_out_px.iter().map(|(model, px)| format!("{} {px:.3}", model.name())).collect();
     format!("{} (kept-out views, px: {})", fit.model.name(), errors.join(", "))

@@ -1,4 +1,4 @@
-//! `flyrig calibrate live`: calibrates a rig while the board is shown, and says what to show next.
+//! `flyrig calibrate live`: calibrates a rig while the board is shown, with instructions for the next step.
 
 use std::{
     fmt::Write as _,
@@ -18,16 +18,13 @@ use flyrig_types::{CameraId, Intrinsics};
 use indicatif::{ProgressBar, ProgressStyle};
 
 use super::{
-    FILES,
-    advice::{Progress, Step, different},
-    page, refuse_existing,
-    rig::{self, PAGE, Target},
-    views::{Seen, TakeArgs},
+    advice::{CalibrationState, Step, different},
+    output::{FILES, refuse_existing},
+    page,
+    rig::{self, PAGE, RigTarget},
+    views::{BoardTakeArgs, SeenBoards, open_frames},
 };
-use crate::{
-    arguments::{BoardArgs, SolveArgs, TargetArgs},
-    take,
-};
+use crate::cli::{CalibrateLiveArgs, TakeArgs};
 
 /// Arguments of `flyrig calibrate live`.
 #[derive(Debug, Args)]
@@ -40,7 +37,7 @@ pub struct CalibrateLiveArgs {
     #[arg(long, default_value = "127.0.0.1:8090")]
     pub listen: String,
     #[command(flatten)]
-    pub take: TakeArgs,
+    pub take: BoardTakeArgs,
     #[command(flatten)]
     pub board: BoardArgs,
     #[command(flatten)]
@@ -54,14 +51,14 @@ fn parse_target_mm(text: &str) -> Result<f64, String> {
     target.ok_or_else(|| "expected millimetres, between 0.01 and 1000".to_owned())
 }
 
-/// Time between two looks at what is missing, and between two solves.
+/// Intervals between two instructions, and between two solves.
 const LOOK_EVERY: Duration = Duration::from_millis(500);
 const SOLVE_EVERY: Duration = Duration::from_secs(3);
-/// Time between two lines where standard error is no terminal.
+/// Interval between two lines if standard error is no terminal.
 const SAY_EVERY: Duration = Duration::from_secs(3);
-/// Boards that a solve under way takes, spread over all; the last solve takes every one.
+/// Largest number of boards in an intermediate solve, spread over all; the last solve uses every board.
 const SOLVED_BOARDS: usize = 120;
-/// New boards that are worth another solve.
+/// Number of new boards that justify another solve.
 const NEW_BOARDS: usize = 4;
 
 /// Runs the command.
@@ -69,41 +66,41 @@ pub fn live(args: &CalibrateLiveArgs, gpu: &dyn Fn() -> Result<GpuContext>) -> R
     stop::flag();
     let board = Board::load(&args.board.board)?;
     refuse_existing(&args.target.out, &[&FILES[..], &[PAGE]].concat(), args.target.force)?;
-    let opened = take::open(&args.take.source.input, args.take.source.rate.fps, gpu)?;
+    let opened = open_frames(&args.take, gpu)?;
     let ids: Vec<CameraId> = opened.sources.iter().map(|source| source.camera().clone()).collect();
     ensure!(ids.len() > 1, "one camera alone is no rig; flyrig calibrate lens calibrates it");
     let server = PageServer::start("--listen", &args.listen, "text/html; charset=utf-8")?;
     eprintln!("calibrate live: progress at http://{}/ (Ctrl-C calibrates with what was seen)", server.address());
     let mut watching = Watching::new(args, board.clone(), server);
-    let mut seen = Seen::look_through(opened, &board, &args.take, |seen, _| watching.look(seen))?;
+    let mut seen = SeenBoards::detect_all(opened, &board, &args.take, |seen, _| watching.update(seen))?;
     watching.show.finish_and_clear();
     different(&seen.shots, watching.looked_at, &seen.sizes, &mut watching.shots);
     seen.shots = watching.shots;
     seen.check(&board)?;
     rig::check_floor(args.solve.floor, &seen)?;
     let lenses = rig::lenses(args.solve.lenses.as_deref(), &board, &seen)?;
-    let target = Target { out: &args.target.out, floor: args.solve.floor, no_offsets: args.solve.no_offsets };
+    let target = RigTarget { out: &args.target.out, floor: args.solve.floor, no_offsets: args.solve.no_offsets };
     rig::solve_and_write(&target, &board, &seen, &lenses, None)
 }
 
-/// A calibration under way.
+/// Calibration under way.
 struct Watching<'a> {
     args: &'a CalibrateLiveArgs,
     board: Board,
     server: PageServer,
     show: ProgressBar,
-    /// Different boards, and the number of shots that they were chosen from.
+    /// Different boards, and the number of shots that they were selected from.
     shots: Vec<BoardShot>,
     looked_at: usize,
-    /// The solve under way.
+    /// Running solve.
     solving: Option<JoinHandle<Result<RigFit, CalibError>>>,
-    /// Result of the last one, when it began, and the boards that there were.
+    /// Result of the last solve, its start, and its number of boards.
     solved: Option<Result<RigFit, CalibError>>,
     began: Option<Instant>,
     solved_boards: usize,
     last_look: Option<Instant>,
     last_step: Option<Step>,
-    /// Time of the last line where standard error is no terminal.
+    /// Time of the last line if standard error is no terminal.
     said: Option<Instant>,
 }
 
@@ -127,8 +124,8 @@ impl<'a> Watching<'a> {
         }
     }
 
-    /// Takes in what was seen so far; ends where every camera is known well enough.
-    fn look(&mut self, seen: &Seen) -> Result<ControlFlow<()>> {
+    /// Updates the instruction from the boards so far; breaks once every camera is known well enough.
+    fn update(&mut self, seen: &SeenBoards) -> Result<ControlFlow<()>> {
         if self.last_look.is_some_and(|last| last.elapsed() < LOOK_EVERY) {
             return Ok(ControlFlow::Continue(()));
         }
@@ -139,10 +136,10 @@ impl<'a> Watching<'a> {
         different(&seen.shots, self.looked_at, &seen.sizes, &mut self.shots);
         self.looked_at = seen.shots.len();
         if let Some(done) = self.solving.take_if(|solving| solving.is_finished()) {
-            // A solve that panicked has said so.
+            // A panic has been logged already.
             self.solved = done.join().ok();
         }
-        let progress = Progress {
+        let progress = CalibrationState {
             ids: &seen.ids,
             sizes: &seen.sizes,
             shots: &self.shots,
@@ -177,10 +174,10 @@ impl<'a> Watching<'a> {
         Ok(ControlFlow::Continue(()))
     }
 
-    /// Solves in a thread of its own: the next boards are looked for meanwhile.
-    fn solve(&self, seen: &Seen) -> Result<JoinHandle<Result<RigFit, CalibError>>> {
+    /// Starts a solve in its own thread, while further boards are detected.
+    fn solve(&self, seen: &SeenBoards) -> Result<JoinHandle<Result<RigFit, CalibError>>> {
         let every = self.shots.len().div_ceil(SOLVED_BOARDS);
-        // The first one may lie on the floor.
+        // The first board may lie on the floor.
         let shots: Vec<BoardShot> = self.shots.iter().step_by(every).cloned().collect();
         let (ids, sizes, board) = (seen.ids.clone(), seen.sizes.clone(), self.board.clone());
         let (lenses, floor_first) = (self.args.solve.lenses.clone(), self.args.solve.floor);
@@ -205,8 +202,8 @@ impl<'a> Watching<'a> {
     }
 }
 
-/// The table of the terminal.
-fn status(progress: &Progress<'_>, sentence: &str) -> String {
+/// Formats the table for the terminal.
+fn status(progress: &CalibrationState<'_>, sentence: &str) -> String {
     let mut text =
         format!("{:<14} {:>7} {:>8} {:>10}  shares boards with\n", "camera", "boards", "covered", "known, mm");
     for (slot, id) in progress.ids.iter().enumerate() {

@@ -7,21 +7,17 @@ use flyrig_report::{Curve, Report, Table};
 use flyrig_types::{Camera, CameraId, ColorMatch, Intrinsics, Isometry, escape_html};
 use glam::{DVec2, DVec3};
 
-use super::advice::Progress;
+use super::advice::{CELLS, CalibrationState, WELL_LINKED};
 
-/// Errors are drawn so many times as long as they are.
+/// Magnification of reprojection errors in drawings.
 const LONGER: f64 = 50.0;
-/// At most so many errors are drawn for each camera.
+/// Largest number of drawn errors per camera.
 const MOST_ERRORS: usize = 1500;
-/// Width of the drawing of an image, and side of the drawing from above.
+/// Width of an image's drawing, and side of the plan, pixels.
 const WIDTH: f64 = 380.0;
 const ABOVE: f64 = 460.0;
-/// Shared boards from which on two cameras are well linked.
-pub(super) const WELL_LINKED: usize = 12;
-/// Columns and rows of cells that say where a camera has seen the board.
-pub(super) const CELLS: [usize; 2] = [8, 6];
 
-/// Builds the page. `sentences` are those that the terminal shows.
+/// Builds the page. `sentences` are those of the terminal.
 pub(super) fn page(ids: &[CameraId], fit: &RigFit, sentences: Vec<String>) -> Report {
     let begin = fit.shots.first().map_or(0, |(nanos, _)| *nanos);
     let secs = |nanos: i64| nanos.saturating_sub(begin) as f64 * 1e-9;
@@ -108,8 +104,8 @@ fn pairs(ids: &[CameraId], fit: &RigFit) -> Table {
     }
 }
 
-/// Builds the page of a calibration under way, which browsers load again by themselves.
-pub(super) fn live(progress: &Progress<'_>, sentence: &str) -> Report {
+/// Builds the page of a calibration under way, which browsers reload by themselves.
+pub(super) fn live(progress: &CalibrationState<'_>, sentence: &str) -> Report {
     let rows = progress.ids.iter().enumerate().map(|(slot, id)| {
         let covered = format!("{:.0} %", 100.0 * progress.covered(slot));
         vec![id.to_string(), progress.boards(slot).to_string(), covered, progress.known(slot)]
@@ -138,8 +134,8 @@ pub(super) fn live(progress: &Progress<'_>, sentence: &str) -> Report {
     }
 }
 
-/// Cameras on a circle; lines join those that share boards, with their number.
-fn links(progress: &Progress<'_>) -> String {
+/// Draws the cameras on a circle, joined by lines with the number of shared boards.
+fn links(progress: &CalibrationState<'_>) -> String {
     let count = progress.ids.len();
     let place = |slot: usize| {
         let angle = std::f64::consts::TAU * slot as f64 / count as f64;
@@ -176,7 +172,7 @@ fn links(progress: &Progress<'_>) -> String {
     svg + "</svg>"
 }
 
-/// Cameras from above, x to the right, y up; lines join those that share boards, the thicker the more.
+/// Draws the cameras from above, x to the right and y up, joined by lines whose width grows with the number of shared boards.
 fn above(ids: &[CameraId], fit: &RigFit) -> String {
     let places: Vec<DVec2> = fit.rig.cameras.iter().map(|camera| camera.position().truncate()).collect();
     let reach = places.iter().map(|place| place.length()).fold(0.5, f64::max);
@@ -213,7 +209,7 @@ fn above(ids: &[CameraId], fit: &RigFit) -> String {
     svg + "</svg>"
 }
 
-/// An image with the corners that were seen.
+/// Draws an image with its detected corners.
 fn covered_image(of: &Camera, corners: &[DVec2], boards: usize) -> String {
     let scale = WIDTH / f64::from(of.intrinsics.width);
     let mut svg = cells(of, &|| corners.iter().copied());
@@ -230,7 +226,7 @@ fn covered_image(of: &Camera, corners: &[DVec2], boards: usize) -> String {
     svg
 }
 
-/// Begins the drawing of an image: cells without a corner are grey.
+/// Begins the drawing of an image, with grey cells where no corner was detected.
 fn cells<I: Iterator<Item = DVec2>>(of: &Camera, corners: &dyn Fn() -> I) -> String {
     let [width, height] = of.size().map(f64::from);
     let scale = WIDTH / width;
@@ -259,7 +255,7 @@ fn cells<I: Iterator<Item = DVec2>>(of: &Camera, corners: &dyn Fn() -> I) -> Str
     svg
 }
 
-/// An image with its corners and their errors.
+/// Draws an image with its corners and their reprojection errors.
 fn image(id: &CameraId, of: &Camera, camera: &RigCamera) -> String {
     let [width, height] = of.size().map(f64::from);
     let scale = WIDTH / width;

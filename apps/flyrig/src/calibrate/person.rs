@@ -1,4 +1,4 @@
-//! `flyrig calibrate person`: better poses and time offsets of cameras from one person who moves.
+//! `flyrig calibrate person`: refines poses and time offsets of cameras from one moving person.
 
 use anyhow::{Context as _, Result, ensure};
 use clap::Args;
@@ -9,15 +9,16 @@ use flyrig_calib::{
 use flyrig_gpu::GpuContext;
 use flyrig_report::{stop, write_whole};
 use flyrig_sync::{HullCorner, silhouette_hull};
+use flyrig_takes::{Calibration, Take, TakeOptions, TakeSpan};
 use flyrig_tracker::{PoseConfig, PoseNet, Viewers};
 use flyrig_types::{Camera, Image, Rig};
 use glam::DVec2;
 use serde_json::json;
 
-use super::{FILES, refuse_existing};
+use super::output::{FILES, refuse_existing};
 use crate::{
     arguments::{CalibrationArgs, InputArgs, SpanArgs, TargetArgs},
-    take::{self, CalibratedTake},
+    opening::open_take,
 };
 
 /// Arguments of `flyrig calibrate person`.
@@ -36,9 +37,9 @@ pub struct CalibratePersonArgs {
     pub target: TargetArgs,
 }
 
-/// Landmarks in use, by their index in the network: nose, eyes, ears, shoulders to wrists, index fingers, hips to toes.
+/// Indices of the landmarks in use in the network's output: nose, eyes, ears, shoulders to wrists, index fingers, hips to toes.
 const LANDMARKS: [usize; 23] = [0, 2, 5, 7, 8, 11, 12, 13, 14, 15, 16, 19, 20, 23, 24, 25, 26, 27, 28, 29, 30, 31, 32];
-/// Pairs of the network's landmarks at a constant distance.
+/// Pairs of landmarks at a constant distance.
 const LIMBS: [(usize, usize); 17] = [
     (7, 8),
     (0, 7),
@@ -61,36 +62,37 @@ const LIMBS: [(usize, usize); 17] = [
 /// Groups of (left, right) landmarks that the network confuses together: face, arms, legs.
 const MIRRORED: [&[(usize, usize)]; 3] =
     [&[(2, 5), (7, 8)], &[(11, 12), (13, 14), (15, 16), (19, 20)], &[(23, 24), (25, 26), (27, 28), (29, 30), (31, 32)]];
-/// Median reprojection error, as a fraction of the image's longer side, beyond which a camera shows somebody else.
+/// Median reprojection error, as a fraction of the image's longer side, beyond which a camera shows another person.
 const MOST_ERROR: f64 = 0.02;
-/// A camera was wrong if the person moves in its image by more than this, and by this multiple of the halves' difference.
+/// Displacement of the person in a camera's image beyond which its pose was wrong, pixels, and as a multiple of the halves' difference.
 const LEAST_MOVED_PX: f64 = 2.0;
 const CLEARLY: f64 = 2.0;
-/// Acceptable difference between the halves of a take, pixels.
+/// Largest acceptable difference between the halves of a take, pixels.
 const MOST_HALVES_PX: f64 = 4.0;
-/// Least offset worth reporting, and largest standard deviation of a useful one, seconds.
+/// Least reported time offset, and largest standard deviation of a useful one, seconds.
 const LEAST_LAG_S: f64 = 0.003;
 const MOST_LAG_SIGMA_S: f64 = 0.008;
-/// Confidence that a landmark needs.
+/// Least confidence of a landmark.
 const CONFIDENCE: f64 = 0.3;
 
 /// Runs the command.
 pub fn person(args: &CalibratePersonArgs, gpu: &dyn Fn() -> Result<GpuContext>) -> Result<()> {
     stop::flag();
     refuse_existing(&args.target.out, &FILES, args.target.force)?;
-    let mut take =
-        take::open_calibrated(&args.source.input, args.source.rate.fps, args.calibration.calibration.as_deref(), gpu)?;
+    let calibration = args.calibration.calibration.as_deref();
+    let options = TakeOptions { fps: args.source.rate.fps, calibration, ..TakeOptions::default() };
+    let mut take = open_take(&args.source.input, &options, gpu)?;
     ensure!(
         !take.is_live,
-        "live cameras cannot be looked at frame by frame; record them first (flyrig record) and give the recording"
+        "live cameras cannot be processed frame by frame; record them first (flyrig record) and give the recording"
     );
-    let (rig, plates) = take
+    let Calibration { rig, plates } = take
         .calibration
         .take()
         .context("no calibration: name its folder with --calibration; flyrig calibrate rig makes one from a board")?;
     ensure!(rig.cameras.len() > 1, "one camera alone has nothing to agree with");
     let known_nanos = take.sync.lags_nanos.clone();
-    let tracks = look_through(args, &rig, plates, take)?;
+    let tracks = track_landmarks(args, &rig, plates, take)?;
     let number = |landmark: usize| LANDMARKS.iter().position(|known| *known == landmark);
     let numbers = |pairs: &[(usize, usize)]| -> Vec<(usize, usize)> {
         pairs.iter().filter_map(|(a, b)| Some((number(*a)?, number(*b)?))).collect()
@@ -109,7 +111,7 @@ pub fn person(args: &CalibratePersonArgs, gpu: &dyn Fn() -> Result<GpuContext>) 
     }
     print(&rig, &tracks, &fit);
     advise(&rig, &fit, options.lags);
-    // Total of the offset that was subtracted already and the residual one.
+    // The total of the already subtracted offset and the residual one.
     let mut better = fit.rig.clone();
     for (camera, solved) in better.cameras.iter_mut().zip(&fit.cameras) {
         let known = known_nanos.get(&camera.id).copied().unwrap_or_default();
@@ -134,17 +136,17 @@ pub fn person(args: &CalibratePersonArgs, gpu: &dyn Fn() -> Result<GpuContext>) 
 }
 
 /// Finds landmarks and silhouettes of the person in all images.
-fn look_through(
+fn track_landmarks(
     args: &CalibratePersonArgs,
     rig: &Rig,
     plates: Vec<Option<Image>>,
-    take: CalibratedTake,
+    take: Take,
 ) -> Result<PersonTracks> {
     let template = default_template(&ShapeParams::default())?;
     let mut viewers = Viewers::new(&PoseNet::embedded()?, &template, rig, plates, &PoseConfig::default())?;
     let mut tracks = PersonTracks::new(rig.cameras.len(), LANDMARKS.len());
     let secs = [args.span.from_secs, args.span.from_secs + args.span.secs];
-    let errors = take::each_set(take.sources, rig, take.sync, 0, secs, "the person, ms of the take", |set| {
+    let errors = take.for_each_set(rig, TakeSpan { secs, spread_nanos: 0 }, "the person, ms of the take", |set| {
         for (slot, found) in viewers.estimate(set)?.into_iter().enumerate() {
             let (Some(found), Some(frame)) = (found, &set.frames[slot]) else { continue };
             if let Some(mask) = found.masks.iter().flatten().next() {
@@ -165,12 +167,12 @@ fn look_through(
         Ok(())
     })?;
     for (slot, camera) in rig.cameras.iter().enumerate() {
-        if let Some(error) = errors.of(slot) {
+        if let Some(error) = errors.get(slot) {
             eprintln!("warning: not every image of camera {} could be used; the last: {error}", camera.id);
         }
         ensure!(
             tracks.images(slot) > 0,
-            "camera {}: nobody is seen; let one person move where all cameras see them whole",
+            "camera {}: no person is seen; let one person move where all cameras see them whole",
             camera.id
         );
     }
@@ -217,7 +219,7 @@ fn print(rig: &Rig, tracks: &PersonTracks, fit: &PersonFit) {
     }
 }
 
-/// Prints which cameras were wrong, how to use the time offsets, and which movement is missing.
+/// Prints the cameras that were wrong, the use of the time offsets, and missing movements.
 fn advise(rig: &Rig, fit: &PersonFit, with_lags: bool) {
     let cameras = || rig.cameras.iter().map(|camera| &camera.id).zip(&fit.cameras);
     for (id, camera) in cameras() {

@@ -12,8 +12,10 @@ use glam::DVec3;
 use serde_json::json;
 
 use super::{
-    FILES, lens, page, refuse_existing,
-    views::{Seen, TakeArgs},
+    lens,
+    output::{FILES, refuse_existing},
+    page,
+    views::{BoardTakeArgs, SeenBoards},
 };
 use crate::arguments::{BoardArgs, SolveArgs, TargetArgs};
 
@@ -21,7 +23,7 @@ use crate::arguments::{BoardArgs, SolveArgs, TargetArgs};
 #[derive(Debug, Args)]
 pub struct CalibrateRigArgs {
     #[command(flatten)]
-    pub take: TakeArgs,
+    pub take: BoardTakeArgs,
     /// Optimize the lenses together with the poses.
     #[arg(long)]
     pub refine_lenses: bool,
@@ -35,20 +37,20 @@ pub struct CalibrateRigArgs {
 
 /// Name of the page about the calibration.
 pub(super) const PAGE: &str = "calibration.html";
-/// Time offsets are kept where they lower the noise to this share.
+/// Ratio of the noise with and without time offsets below which they are kept.
 const OFFSETS_PAY: f64 = 0.95;
-/// A bend is kept where it lowers the noise to this share, and is this many times its standard deviation.
+/// Ratio of the noise with and without a bent board below which the bend is kept, and its least multiple of the standard deviation.
 const BEND_PAYS: f64 = 0.95;
 const BEND_SIGMAS: f64 = 5.0;
-/// A take with `--floor` shows the board within so many seconds.
+/// Time within which a take with `--floor` must show the board, seconds.
 const FLOOR_WITHIN_SECS: f64 = 2.0;
-/// Cameras look down on a floor by less than this, degrees.
+/// Largest angle between cameras and a floor that they look down on, degrees.
 const MOST_TILT_DEG: f64 = 70.0;
-/// Halves of the shots may differ by so many times what noise explains.
+/// Largest difference between the halves of the shots, as a multiple of the noise.
 const MOST_DISAGREEMENT: f64 = 1.5;
 
-/// Where results go, and how the rig is solved.
-pub(super) struct Target<'a> {
+/// Destination of the results, and options of the solve.
+pub(super) struct RigTarget<'a> {
     pub out: &'a Path,
     pub floor: bool,
     pub no_offsets: bool,
@@ -59,17 +61,17 @@ pub fn rig(args: &CalibrateRigArgs, gpu: &dyn Fn() -> Result<GpuContext>) -> Res
     stop::flag();
     let board = Board::load(&args.board.board)?;
     refuse_existing(&args.target.out, &[&FILES[..], &[PAGE]].concat(), args.target.force)?;
-    let seen = Seen::find(&args.take, &board, gpu)?;
+    let seen = SeenBoards::find(&args.take, &board, gpu)?;
     ensure!(seen.ids.len() > 1, "one camera alone is no rig; flyrig calibrate lens calibrates it");
     check_floor(args.solve.floor, &seen)?;
     let lenses = lenses(args.solve.lenses.as_deref(), &board, &seen)?;
     let refine = args.refine_lenses.then_some(LensModel::RadialTangential);
-    let target = Target { out: &args.target.out, floor: args.solve.floor, no_offsets: args.solve.no_offsets };
+    let target = RigTarget { out: &args.target.out, floor: args.solve.floor, no_offsets: args.solve.no_offsets };
     solve_and_write(&target, &board, &seen, &lenses, refine)
 }
 
 /// Checks that a take with `--floor` begins with the board.
-pub(super) fn check_floor(floor: bool, seen: &Seen) -> Result<()> {
+pub(super) fn check_floor(floor: bool, seen: &SeenBoards) -> Result<()> {
     if floor {
         let first = seen.shots.first().map_or(i64::MAX, |shot| shot.nanos);
         let late_secs = first.saturating_sub(seen.begin_nanos) as f64 * 1e-9;
@@ -84,9 +86,9 @@ pub(super) fn check_floor(floor: bool, seen: &Seen) -> Result<()> {
 
 /// Calibrates the poses, prints them, and writes all files.
 pub(super) fn solve_and_write(
-    args: &Target<'_>,
+    args: &RigTarget<'_>,
     board: &Board,
-    seen: &Seen,
+    seen: &SeenBoards,
     lenses: &[Intrinsics],
     refine: Option<LensModel>,
 ) -> Result<()> {
@@ -95,7 +97,7 @@ pub(super) fn solve_and_write(
         calibrate_rig(board, &seen.ids, lenses, &seen.shots, options)
     };
     let plain = solve(false, false)?;
-    // Offsets only where the board moved, and where they explain something.
+    // Offsets are kept only if the board moved and they lower the noise.
     let with_offsets = if args.no_offsets { None } else { solve(true, false).ok() };
     let better = |fit: &RigFit| {
         fit.sigma_px < OFFSETS_PAY * plain.sigma_px && fit.cameras.iter().all(|camera| camera.deviation.is_some())
@@ -146,8 +148,8 @@ pub(super) fn solve_and_write(
     Ok(())
 }
 
-/// The lenses of a folder, or as calibrated from this take.
-pub(super) fn lenses(folder: Option<&Path>, board: &Board, seen: &Seen) -> Result<Vec<Intrinsics>> {
+/// Loads the lenses of a folder, or calibrates them from this take.
+pub(super) fn lenses(folder: Option<&Path>, board: &Board, seen: &SeenBoards) -> Result<Vec<Intrinsics>> {
     let Some(folder) = folder else {
         return Ok(lens::solve(board, seen)?.into_iter().map(|(_, intrinsics)| intrinsics).collect());
     };
@@ -165,7 +167,7 @@ pub(super) fn lenses(folder: Option<&Path>, board: &Board, seen: &Seen) -> Resul
     seen.ids.iter().map(of).collect()
 }
 
-fn print(seen: &Seen, fit: &RigFit, has_offsets: bool) {
+fn print(seen: &SeenBoards, fit: &RigFit, has_offsets: bool) {
     let pair =
         |values: Option<(f64, f64)>| values.map_or_else(|| "open".to_owned(), |(deg, mm)| format!("{deg:.3} {mm:.1}"));
     println!(
@@ -194,8 +196,8 @@ fn print(seen: &Seen, fit: &RigFit, has_offsets: bool) {
     }
 }
 
-/// Returns the results of the solve as sentences, for the terminal and the page.
-fn sentences(seen: &Seen, fit: &RigFit, noise_without_offsets: Option<f64>) -> Vec<String> {
+/// Formats the results of the solve as sentences, for the terminal and the page.
+fn sentences(seen: &SeenBoards, fit: &RigFit, noise_without_offsets: Option<f64>) -> Vec<String> {
     let mut lines = vec![format!(
         "rms {:.3} px, noise {:.3} px a coordinate, {} boards",
         fit.rms_px,
@@ -243,7 +245,7 @@ fn sentences(seen: &Seen, fit: &RigFit, noise_without_offsets: Option<f64>) -> V
 }
 
 /// `calibration.json`.
-fn report(seen: &Seen, fit: &RigFit) -> serde_json::Value {
+fn report(seen: &SeenBoards, fit: &RigFit) -> serde_json::Value {
     let cameras: Vec<_> = seen
         .ids
         .iter()

@@ -13,17 +13,18 @@ use flyrig_fusion::{InputFormat, Intake};
 use flyrig_gpu::GpuContext;
 use flyrig_report::{arguments::parse_seconds, progress_bar, stop};
 use flyrig_sync::SyncSettings;
+use flyrig_takes::{Needs, Take, TakeOptions};
 use flyrig_types::{CameraId, FrameSet};
 use rayon::prelude::*;
 
 use crate::{
     arguments::{InputArgs, parse_most_ms},
-    take::{self, Take},
+    opening::open_take,
 };
 
 /// A take of a board, and the part that is used.
 #[derive(Debug, Args)]
-pub struct TakeArgs {
+pub struct BoardTakeArgs {
     /// Seconds of the input that are used.
     #[arg(long, default_value_t = 120.0, value_parser = parse_seconds)]
     pub secs: f64,
@@ -34,42 +35,47 @@ pub struct TakeArgs {
     pub source: InputArgs,
 }
 
-/// Images that are looked at together.
+/// Number of images that are searched in parallel.
 const BATCH: usize = 16;
 
-/// Seconds that live cameras may take until their first frame.
+/// Time that live cameras have for their first frame, seconds.
 const PATIENCE_SECS: f64 = 15.0;
 
+/// Opens the frames of a take. `gpu` opens a graphics adapter, for simulated cameras alone.
+pub fn open_frames(args: &TakeArgs, gpu: &dyn Fn() -> Result<GpuContext>) -> Result<Take> {
+    let options = TakeOptions { fps: args.fps, needs: Needs::Frames, ..TakeOptions::default() };
+    open_take(&args.input, &options, gpu)
+}
+
 /// Boards that were seen in a take.
-pub struct Seen {
+pub struct SeenBoards {
     pub ids: Vec<CameraId>,
-    /// By camera, pixels; `None` for one without an image.
+    /// Width and height of each camera's images, pixels; `None` without an image.
     pub sizes: Vec<Option<[u32; 2]>>,
-    /// Sets in which at least one camera saw the board.
+    /// Frame sets in which at least one camera saw the board.
     pub shots: Vec<BoardShot>,
-    /// By camera: images that were looked at.
+    /// Number of searched images per camera.
     pub images: Vec<usize>,
-    /// Time of the first set, nanoseconds.
+    /// Time of the first frame set, nanoseconds.
     pub begin_nanos: i64,
 }
 
-impl Seen {
-    /// Opens a take and looks for the board; every camera must see it. `gpu` opens a graphics adapter, for simulated cameras alone.
+impl SeenBoards {
+    /// Opens a take and detects the board, which every camera must see. `gpu` opens a graphics adapter, for simulated cameras alone.
     pub fn find(args: &TakeArgs, board: &Board, gpu: &dyn Fn() -> Result<GpuContext>) -> Result<Self> {
         let bar = progress_bar((args.secs * 1e3) as u64, "boards, ms of the take");
-        let seen =
-            Self::look_through(take::open(&args.source.input, args.source.rate.fps, gpu)?, board, args, |seen, at| {
-                bar.set_position((at * 1e3) as u64);
-                bar.set_message(format!("{} boards", seen.shots.iter().map(|shot| shot.views.len()).sum::<usize>()));
-                Ok(ControlFlow::Continue(()))
-            })?;
+        let seen = Self::detect_all(open_frames(args, gpu)?, board, args, |seen, at| {
+            bar.set_position((at * 1e3) as u64);
+            bar.set_message(format!("{} boards", seen.shots.iter().map(|shot| shot.views.len()).sum::<usize>()));
+            Ok(ControlFlow::Continue(()))
+        })?;
         bar.finish_and_clear();
         seen.check(board)?;
         Ok(seen)
     }
 
-    /// Looks for the board in a take until it ends; `each` is called with what was seen so far and the seconds of the take, and may end it.
-    pub fn look_through(
+    /// Detects the board in a take until its end. `each` gets the results so far and the seconds since the first frame set, and may break.
+    pub fn detect_all(
         take: Take,
         board: &Board,
         args: &TakeArgs,
@@ -81,8 +87,8 @@ impl Seen {
         let count = ids.len();
         let mut seen =
             Self { ids, sizes: vec![None; count], shots: Vec::new(), images: vec![0; count], begin_nanos: 0 };
-        let mut intake =
-            Intake::start_opening(take.sources, InputFormat::AnySize, &SyncSettings::default(), take.pacing)?;
+        let pacing = take.pacing();
+        let mut intake = Intake::start_opening(take.sources, InputFormat::AnySize, &SyncSettings::default(), pacing)?;
         let started = Instant::now();
         let (mut first, mut next, mut batch) = (None, i64::MIN, Vec::new());
         while !intake.ended() && !stop::requested() {
@@ -100,21 +106,21 @@ impl Seen {
             if at > secs {
                 break;
             }
-            // A little early is the right set where stamps jitter.
+            // Jitter may bring the right frame set slightly early.
             if set.master_nanos < next {
                 continue;
             }
             next = set.master_nanos.saturating_add((0.9 * every_nanos) as i64);
             batch.push(set);
             if batch.len() * count >= BATCH {
-                seen.look(&batch, detector.as_ref())?;
+                seen.detect(&batch, detector.as_ref())?;
                 batch.clear();
                 if each(&seen, at)?.is_break() {
                     break;
                 }
             }
         }
-        seen.look(&batch, detector.as_ref())?;
+        seen.detect(&batch, detector.as_ref())?;
         for (slot, id) in seen.ids.iter().enumerate() {
             match intake.last_error(slot) {
                 Some(error) if seen.images[slot] == 0 => {
@@ -127,7 +133,7 @@ impl Seen {
         Ok(seen)
     }
 
-    fn look(&mut self, sets: &[FrameSet], detector: &dyn BoardDetector) -> Result<()> {
+    fn detect(&mut self, sets: &[FrameSet], detector: &dyn BoardDetector) -> Result<()> {
         let jobs: Vec<(usize, usize)> =
             sets.iter().enumerate().flat_map(|(i, set)| set.present().map(move |(slot, _)| (i, slot))).collect();
         let found: BTreeMap<(usize, usize), BoardView> = jobs
@@ -163,12 +169,12 @@ impl Seen {
         Ok(())
     }
 
-    /// Views of one camera, in the order of time.
+    /// Returns the views of one camera in the order of time.
     pub fn of_camera(&self, slot: usize) -> Vec<BoardView> {
         self.shots.iter().flat_map(|shot| &shot.views).filter(|view| view.camera == slot).cloned().collect()
     }
 
-    /// Checks that every camera saw the board at all.
+    /// Checks that every camera saw the board.
     pub fn check(&self, board: &Board) -> Result<()> {
         for (slot, id) in self.ids.iter().enumerate() {
             ensure!(

@@ -1,4 +1,4 @@
-//! ꟻLIP (Andersson et al. 2020, low dynamic range) through NVIDIA's own code.
+//! ꟻLIP (Andersson et al. 2020, low dynamic range), computed by NVIDIA's code.
 
 use nv_flip::{DEFAULT_PIXELS_PER_DEGREE, FlipImageFloat, FlipImageRgb8, FlipPool, magma_lut};
 
@@ -7,25 +7,25 @@ use super::{MetricError, Picture, PixelBox};
 /// Per-pixel ꟻLIP error of the box.
 #[derive(Debug, Clone, PartialEq)]
 pub struct FlipMap {
-    /// Pixels.
+    /// Width, pixels.
     pub width: u32,
-    /// Pixels.
+    /// Height, pixels.
     pub height: u32,
-    /// 0 (equal) to 1, row by row.
+    /// Error from 0 (equal) to 1, row by row.
     pub error: Vec<f32>,
     /// Mean error, the single number of ꟻLIP.
     pub mean: f64,
 }
 
 impl FlipMap {
-    /// The error as an image, RGB bytes in the perceptually even magma colours: black is equal, bright is far.
+    /// Returns the error as RGB bytes in the perceptually uniform magma colours: black for equal pixels, bright for large errors.
     #[must_use]
     pub fn to_rgb8(&self) -> Vec<u8> {
         FlipImageFloat::with_data(self.width, self.height, &self.error).apply_color_lut(&magma_lut()).to_vec()
     }
 }
 
-/// ꟻLIP between the truth and ours inside the box, at 67 pixels a degree (ꟻLIP's own default); images are rounded
+/// Computes ꟻLIP between `truth` and `ours` inside the box, at 67 pixels per degree (the default of ꟻLIP); images are rounded
 /// to 8 bits.
 ///
 /// # Errors

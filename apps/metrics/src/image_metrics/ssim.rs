@@ -10,7 +10,7 @@ const SIGMA_PX: f64 = 1.5;
 const C1: f64 = 0.01 * 0.01;
 const C2: f64 = 0.03 * 0.03;
 
-/// SSIM inside the box (pixels outside it are not looked at, not even by the window), at most 1.
+/// Computes SSIM inside the box, at most 1; windows do not reach beyond the box.
 ///
 /// # Errors
 /// [`MetricError::SizeMismatch`], [`MetricError::EmptyBox`].
@@ -45,7 +45,7 @@ fn kernel() -> [f64; 2 * RADIUS as usize + 1] {
     raw.map(|x| x / sum)
 }
 
-/// Mirror without repeating the edge, as often as a narrow image needs.
+/// Mirrors an index without repeating the edge, several times in a narrow image.
 fn mirror(index: i64, len: usize) -> usize {
     let last = len as i64 - 1;
     if last == 0 {

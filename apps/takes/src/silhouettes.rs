@@ -1,4 +1,4 @@
-//! Silhouettes of one person in the images of every camera by itself.
+//! Silhouettes of one person, found in each camera independently.
 
 use anyhow::Result;
 use flyrig_body::{ShapeParams, default_template};
@@ -6,22 +6,28 @@ use flyrig_sync::SilhouetteTrack;
 use flyrig_tracker::{PoseConfig, PoseNet, Viewers};
 use flyrig_types::{FrameSet, Image, Rig};
 
-/// Finder of silhouettes.
-pub struct Silhouettes {
+/// Finder of one person's silhouettes.
+pub struct SilhouetteFinder {
     viewers: Viewers,
     tracks: Vec<SilhouetteTrack>,
     given_masks: bool,
 }
 
-impl Silhouettes {
-    /// Creates a finder. `plates` are images of the empty scene by slot; `given_masks` uses the masks of the take.
+impl SilhouetteFinder {
+    /// Creates a finder. `plates` are images of the empty scene, one per slot; `given_masks` uses the frames' own masks.
+    ///
+    /// # Errors
+    /// The network cannot be loaded, or a plate does not fit its camera.
     pub fn new(rig: &Rig, plates: Vec<Option<Image>>, given_masks: bool) -> Result<Self> {
         let template = default_template(&ShapeParams::default())?;
         let viewers = Viewers::new(&PoseNet::embedded()?, &template, rig, plates, &PoseConfig::default())?;
         Ok(Self { viewers, tracks: rig.cameras.iter().map(SilhouetteTrack::new).collect(), given_masks })
     }
 
-    /// Adds the images of a set.
+    /// Adds the silhouettes of a frame set.
+    ///
+    /// # Errors
+    /// An image cannot be read by the network.
     pub fn add(&mut self, set: &FrameSet) -> Result<()> {
         let mut unknown = set.clone();
         for (track, frame) in self.tracks.iter_mut().zip(&mut unknown.frames) {
@@ -45,6 +51,7 @@ impl Silhouettes {
     }
 
     /// Returns one track per camera.
+    #[must_use]
     pub fn into_tracks(self) -> Vec<SilhouetteTrack> {
         self.tracks
     }

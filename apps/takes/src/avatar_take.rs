@@ -1,37 +1,38 @@
-//! The person of a take, tracked as live, for an avatar that is fitted to its images.
+//! Tracking of a take's person, with the images that an avatar is fitted to.
 
 use anyhow::{Context as _, Result, bail};
 use flyrig_avatar::{Avatar, KnownPoses, TrainingFrame, TrainingView};
 use flyrig_fusion::{BodySettings, Outcome, PersonId, person_surface};
 use flyrig_renderer::HarmonicOrder;
+use flyrig_report::{progress_bar, stop};
 use flyrig_types::{Camera, FrameSet};
 use glam::Vec2;
 
-use crate::{Replay, frame_number, progress_bar, stop};
+use crate::replay::{Replay, frame_number};
 
-/// A tracked take.
+/// Tracked take.
 #[derive(Debug)]
 pub struct AvatarTake {
     /// Frames in which the person was found.
     pub frames: Vec<TrainingFrame>,
-    /// Images of the person, cut to it.
+    /// Input images, cropped to the person.
     pub views: Vec<TrainingView>,
-    /// The avatar as the person is drawn live.
+    /// Initial avatar, which looks like the live rendering.
     pub avatar: Avatar,
-    /// Texture coordinates of its Gaussians, empty without any.
+    /// Texture coordinates of its Gaussians; empty if the template has none.
     pub uvs: Vec<Vec2>,
-    /// First frame, and the one after the last.
+    /// Number of the first frame, and of the last one plus 1.
     pub numbers: [u64; 2],
     /// First camera.
     pub camera: Camera,
 }
 
 impl AvatarTake {
-    /// Tracks the person of a replay whose session draws it with `body`, until the end or Ctrl-C. `each` sees every frame in which it was
-    /// found, after it was taken in.
+    /// Tracks the person of a replay until the end or Ctrl-C. `body` are the session's settings; `each` is called after every frame set in
+    /// which the person was found.
     ///
     /// # Errors
-    /// Nobody was found; what the session or the data set reports; errors of `each`.
+    /// No person was found; errors of the session, the data set and `each`.
     pub fn track(
         replay: &mut Replay,
         body: &BodySettings,
@@ -60,7 +61,7 @@ impl AvatarTake {
         bar.finish_and_clear();
         let subject = replay.session.subject(person);
         let (Some(subject), Some(first), Some(last)) = (subject, numbers.first(), numbers.last()) else {
-            bail!("nobody was found in the take; run with -v to see why");
+            bail!("no person was found in the take; run with -v to see why");
         };
         let (surface, graph) = person_surface(subject.template(), body)?;
         let deforms = frames.iter().any(|frame| !frame.translations.is_empty());

@@ -1,4 +1,4 @@
-//! Cameras of other computers, behind the same trait as all others.
+//! Cameras of other computers as capture sources.
 
 use std::{
     sync::Arc,
@@ -10,25 +10,26 @@ use flyrig_capture::{CameraSource, CaptureError, CaptureErrorKind, NetworkHealth
 use flyrig_transport::{CameraLink, CameraStatus, CameraSubscriber, HostClock, TransportConfig, TransportErrorKind};
 use flyrig_types::{CameraId, Frame, Rig, ThreadWatch};
 
-/// A camera that was there is silent after this.
+/// Silence after which a camera that has delivered frames counts as disconnected.
 const SILENT: Duration = Duration::from_millis(700);
-/// A camera that was not there yet is missed after this.
+/// Time that a camera has for its first frame before it counts as disconnected.
 const FIRST_FRAME: Duration = Duration::from_secs(5);
-/// How often the health is put together.
+/// Interval at which the health is updated.
 const HEALTH_EVERY: Duration = Duration::from_millis(250);
 
-/// This computer's clock.
+/// Returns this computer's monotonic clock.
+#[must_use]
 pub fn host_clock() -> HostClock {
     HostClock::new(flyrig_capture::monotonic_nanos)
 }
 
-/// Returns an opener for every camera of the rig, all in one session, and the thread that compares their clocks.
+/// Returns an opener for every camera of the rig, all in one session, and the thread that measures their clock offsets.
 ///
 /// # Errors
 /// Names settings of the session that are wrong.
-pub fn openers(transport: &TransportConfig, rig: &Rig) -> Result<(Vec<SourceOpener>, ThreadWatch)> {
+pub(crate) fn openers(transport: &TransportConfig, rig: &Rig) -> Result<(Vec<SourceOpener>, ThreadWatch)> {
     let cameras: Vec<CameraId> = rig.cameras.iter().map(|camera| camera.id.clone()).collect();
-    // It listens nowhere: that address is the results'.
+    // `listen` is the address of the results, so this session must not listen there.
     let transport = TransportConfig { listen: Vec::new(), ..transport.clone() };
     let subscriber = CameraSubscriber::open(&transport, &cameras, host_clock())
         .context("source.kind is \"network\": transport.connect must name the computers with cameras or a router")?;
@@ -44,20 +45,20 @@ pub fn openers(transport: &TransportConfig, rig: &Rig) -> Result<(Vec<SourceOpen
     Ok((rig.cameras.iter().map(opener).collect(), clocks))
 }
 
-/// A camera of another computer, with capture times on this computer's clock.
+/// Camera of another computer, with capture times on this computer's clock.
 struct NetworkCamera {
     camera: CameraId,
-    /// As calibrated.
+    /// Calibrated width and height, pixels.
     size: (u32, u32),
     subscriber: Arc<CameraSubscriber>,
-    /// The last frame, or the start.
+    /// Time of the last frame, or of the opening.
     heard: Instant,
     has_come: bool,
     is_missed: bool,
     returns: u64,
     silences: u64,
-    /// The link when this was opened. It goes on counting while a camera is opened again, and the counts of earlier sources
-    /// are kept elsewhere.
+    /// Link when this source was opened: its counts continue when a camera is opened again, and those of earlier sources are kept
+    /// elsewhere.
     opened: CameraLink,
     health: SourceHealth,
     health_at: Option<Instant>,
@@ -85,7 +86,7 @@ impl NetworkCamera {
         CaptureError::new(&self.camera, kind, message)
     }
 
-    fn nothing(&mut self) -> CaptureError {
+    fn missing_frame_error(&mut self) -> CaptureError {
         let why = self.subscriber.absence(&self.camera);
         let patience = if self.has_come { SILENT } else { FIRST_FRAME };
         if self.is_missed || self.heard.elapsed() < patience {
@@ -96,7 +97,7 @@ impl NetworkCamera {
         self.error(CaptureErrorKind::Disconnected, why)
     }
 
-    fn look(&mut self) {
+    fn update_health(&mut self) {
         if self.health_at.is_some_and(|at| at.elapsed() < HEALTH_EVERY) {
             return;
         }
@@ -112,9 +113,9 @@ impl NetworkCamera {
     }
 }
 
-/// Returns the health of a link, counted since it was as in `opened`.
+/// Returns the health of a link, with counts since its state `opened`.
 fn health_since(link: &CameraLink, opened: &CameraLink) -> SourceHealth {
-    // A camera's computer that starts anew counts from 0.
+    // Counts restart at 0 when the camera's computer restarts.
     let since = |now: u64, then: u64| now.checked_sub(then).unwrap_or(now);
     let (no_status, none) = (CameraStatus::default(), CameraStatus::default());
     let (status, then) = (link.status.as_ref().unwrap_or(&no_status), opened.status.as_ref().unwrap_or(&none));
@@ -144,10 +145,10 @@ impl CameraSource for NetworkCamera {
 
     fn next_frame(&mut self, timeout: Duration) -> Result<Frame, CaptureError> {
         let came = self.subscriber.next_frame(&self.camera, timeout);
-        self.look();
+        self.update_health();
         let frame = match came {
             Ok(Some(frame)) => frame,
-            Ok(None) => return Err(self.nothing()),
+            Ok(None) => return Err(self.missing_frame_error()),
             Err(error) if error.kind == TransportErrorKind::Config => {
                 return Err(self.error(CaptureErrorKind::Unsupported, error.to_string()));
             }

@@ -1,4 +1,4 @@
-//! An avatar for viewers who draw it themselves from poses alone.
+//! Avatars as stream templates, which viewers pose and render themselves.
 
 use anyhow::{Context as _, Result};
 use flyrig_avatar::{Avatar, Bones, PosedAvatar};
@@ -7,10 +7,10 @@ use flyrig_renderer::SH_DEGREE_0;
 use flyrig_stream::{AvatarGaussian, AvatarSource, EncodedTemplate, TemplateSource};
 use glam::Vec3;
 
-/// Encodes an avatar at rest, in the mean shape of its clothes and hair, with its colours of order zero.
+/// Encodes an avatar in its rest pose, with the mean shape of its clothes and hair and its colours of order zero.
 ///
 /// # Errors
-/// Names what cannot be sent.
+/// A value is not finite or too large for the format.
 pub fn encode_avatar(avatar: &Avatar) -> Result<EncodedTemplate> {
     let template = &avatar.template;
     let mut rest = PosedAvatar::default();
@@ -25,7 +25,7 @@ pub fn encode_avatar(avatar: &Avatar) -> Result<EncodedTemplate> {
             AvatarGaussian { scale_m: [x, y, z], opacity, rotation, color }
         })
         .collect();
-    // Viewers of isotropic Gaussians draw discs of the same area.
+    // Viewers of isotropic Gaussians render discs of equal area.
     let size = |[x, y, z]: [f32; 3]| {
         let mut scales = [x, y, z];
         scales.sort_by(f32::total_cmp);
@@ -61,7 +61,7 @@ mod tests {
 
     use super::*;
 
-    /// An avatar of stripes whose clothes hang 3 cm in front of the body, with needles of all directions.
+    /// Returns a striped avatar whose clothes hang 3 cm in front of the body, with stretched Gaussians in all directions.
     fn avatar() -> Avatar {
         let template = default_template(&ShapeParams::default()).unwrap();
         let surface = sample_surface(&template, 12_000, 5).unwrap();
@@ -131,12 +131,12 @@ mod tests {
             ours.set_people([shown]).unwrap();
             let (found, expected) = (ours.draw(&camera).unwrap(), theirs.draw(&camera).unwrap());
             let opaque = expected.rgba.chunks_exact(4).filter(|pixel| pixel[3] > 200).count();
-            assert!(opaque > 2000, "{opaque} pixels show somebody");
+            assert!(opaque > 2000, "{opaque} pixels show the person");
             let squares: f64 =
                 found.rgba.iter().zip(&expected.rgba).map(|(a, b)| f64::from(a.abs_diff(*b)).powi(2)).sum();
             let decibels = 10.0 * (255.0f64.powi(2) * found.rgba.len() as f64 / squares.max(1.0)).log10();
             assert!(decibels > 38.0, "{side}: {decibels} dB");
-            // Beside somebody who is no avatar, both are drawn.
+            // Beside a person without an avatar, both are rendered.
             let mut far = posed.clone();
             far.center_scale.iter_mut().for_each(|row| row[0] += 100.0);
             let plain = ShownPerson::from((&far, colors));

@@ -1,4 +1,4 @@
-//! Replaces some joints of an estimated pose by the true ones, to measure the cost of each part of a pose.
+//! Estimated poses with some true joints, which measure the cost of each part of a pose.
 
 use flyrig_body::Template;
 use flyrig_fusion::{
@@ -7,19 +7,20 @@ use flyrig_fusion::{
 use flyrig_types::{FrameSet, Pose, PoseTrack};
 use glam::DQuat;
 
-/// Word for the true position of the root joint.
+/// Name that selects the true position of the root joint.
 const PLACE: &str = "place";
 
-/// Replaces orientations of joints, in the world, by the true ones. Template and track have one skeleton.
+/// Perception that replaces world orientations of joints by the true ones. Template and track share a skeleton.
 pub(crate) struct TrueJoints {
     pub inner: EstimatedPerception,
     pub template: Template,
     pub track: PoseTrack,
-    /// Parts of joints' names, or [`PLACE`].
+    /// Substrings of the joints' names, or [`PLACE`].
     pub names: Vec<String>,
 }
 
 impl TrueJoints {
+    /// Returns `pose` with the chosen joints in the world orientations of `truth`.
     fn mix(&self, pose: &Pose, truth: &Pose) -> Pose {
         let joints = self.template.skeleton.joints();
         let is_true =

@@ -1,0 +1,158 @@
+//! Stored footage: a folder of images, a recording, or videos.
+
+use std::path::{Path, PathBuf};
+
+use anyhow::{Context as _, Result, ensure};
+use flyrig_capture::{CameraSource, FolderOptions, FolderReplay, McapReplay, VideoOptions, VideoReplay};
+use flyrig_types::{CameraId, Rig};
+
+use crate::{dataset, recorded::recorded_cameras};
+
+/// Stored images of several cameras.
+///
+/// ```
+/// use std::path::Path;
+/// use flyrig_takes::Footage;
+///
+/// assert!(matches!(Footage::from_dataset(Path::new("take.mcap")), Footage::Recording(_)));
+/// assert!(matches!(Footage::from_dataset(Path::new("data/walk")), Footage::Folder(_)));
+/// ```
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub enum Footage {
+    /// Folder in EasyMocap's layout, with `images/CAM/*`.
+    Folder(PathBuf),
+    /// File of `flyrig record`.
+    Recording(PathBuf),
+    /// Video files, one per camera, each named after its camera.
+    Videos(Vec<PathBuf>),
+}
+
+/// Opened cameras of [`Footage`].
+pub struct OpenFootage {
+    /// One source per camera.
+    pub sources: Vec<Box<dyn CameraSource>>,
+    /// Frames of the longest camera of a folder; 0 where the number is unknown before reading.
+    pub frames: usize,
+}
+
+impl Footage {
+    /// Returns the footage of a data set: a recording by the ending of its name, or else a folder, which need not exist yet.
+    #[must_use]
+    pub fn from_dataset(path: &Path) -> Self {
+        let path_buf = path.to_owned();
+        if has_ending(path, "mcap") && !path.is_dir() { Self::Recording(path_buf) } else { Self::Folder(path_buf) }
+    }
+
+    /// Finds the footage that a command line names: one folder, one recording, or videos.
+    ///
+    /// # Errors
+    /// The only path does not exist.
+    pub fn from_paths(paths: &[PathBuf]) -> Result<Self> {
+        match paths {
+            [path] if has_ending(path, "mcap") || path.is_dir() => Ok(Self::from_dataset(path)),
+            videos => {
+                if let [path] = videos {
+                    ensure!(
+                        path.exists(),
+                        "{} is no configuration, recording or folder; it does not exist",
+                        path.display()
+                    );
+                }
+                Ok(Self::Videos(videos.to_vec()))
+            }
+        }
+    }
+
+    /// Returns the root folder; `None` for recordings and videos.
+    #[must_use]
+    pub fn folder(&self) -> Option<&Path> {
+        match self {
+            Self::Folder(root) => Some(root),
+            Self::Recording(_) | Self::Videos(_) => None,
+        }
+    }
+
+    /// Loads the footage's own calibration; for a folder, `chosen` are the cameras whose images must be there.
+    ///
+    /// # Errors
+    /// The calibration is missing or wrong.
+    pub fn load_rig(&self, chosen: &[CameraId]) -> Result<Rig> {
+        match self {
+            Self::Folder(root) => dataset::load_rig(root, chosen),
+            Self::Recording(path) => recorded_cameras(path)?.calibrated(path),
+            Self::Videos(_) => anyhow::bail!("videos have no calibration of their own; name its folder"),
+        }
+    }
+
+    /// Opens cameras in the order of `cameras`; all of them for `None`. `options` apply to folders.
+    ///
+    /// # Errors
+    /// Names the camera or file that cannot be opened.
+    pub fn open(&self, cameras: Option<&[CameraId]>, options: &FolderOptions) -> Result<OpenFootage> {
+        match self {
+            Self::Folder(root) => {
+                let sources = FolderReplay::open(root, cameras, options)?;
+                let frames = sources.iter().map(FolderReplay::remaining).max().unwrap_or(0);
+                Ok(OpenFootage { sources: sources.into_iter().map(boxed).collect(), frames })
+            }
+            Self::Recording(path) => {
+                let open = |id: &CameraId| Ok(boxed(McapReplay::open(id, path)?));
+                let sources = match cameras {
+                    Some(ids) => ids.iter().map(open).collect::<Result<_>>()?,
+                    None => recorded_cameras(path)?.ids.iter().map(open).collect::<Result<_>>()?,
+                };
+                Ok(OpenFootage { sources, frames: 0 })
+            }
+            Self::Videos(files) => {
+                let open = |(id, file): (CameraId, &PathBuf)| {
+                    Ok(boxed(VideoReplay::open(&id, file, &VideoOptions::default())?))
+                };
+                let all = files.iter().map(|file| (video_camera(file), file));
+                let sources = match cameras {
+                    None => all.map(open).collect::<Result<_>>()?,
+                    Some(ids) => {
+                        let all: Vec<_> = all.collect();
+                        let find = |id: &CameraId| all.iter().find(|(known, _)| known == id).cloned();
+                        let found = ids.iter().map(|id| find(id).with_context(|| format!("no video of camera {id}")));
+                        found.map(|video| open(video?)).collect::<Result<_>>()?
+                    }
+                };
+                Ok(OpenFootage { sources, frames: 0 })
+            }
+        }
+    }
+}
+
+fn boxed<S: CameraSource + 'static>(source: S) -> Box<dyn CameraSource> {
+    Box::new(source)
+}
+
+/// Returns the camera of a video: the file's name without its ending.
+fn video_camera(file: &Path) -> CameraId {
+    file.file_stem().map(|stem| stem.to_string_lossy().into_owned()).unwrap_or_default().into()
+}
+
+/// Returns whether a path has an ending such as "mcap", in any case.
+pub(crate) fn has_ending(path: &Path, ending: &str) -> bool {
+    path.extension().is_some_and(|found| found.eq_ignore_ascii_case(ending))
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn paths_are_told_apart() {
+        let folder = tempfile::tempdir().unwrap();
+        let at = |name: &str| folder.path().join(name);
+        std::fs::create_dir(at("dir.mcap")).unwrap();
+        std::fs::write(at("a.mp4"), b"").unwrap();
+        let find = |names: &[&str]| Footage::from_paths(&names.iter().map(|name| at(name)).collect::<Vec<_>>());
+        assert_eq!(find(&["dir.mcap"]).unwrap(), Footage::Folder(at("dir.mcap")));
+        assert_eq!(find(&["take.MCAP"]).unwrap(), Footage::Recording(at("take.MCAP")));
+        assert_eq!(find(&["a.mp4"]).unwrap(), Footage::Videos(vec![at("a.mp4")]));
+        assert_eq!(find(&["a.mp4", "b.mp4"]).unwrap(), Footage::Videos(vec![at("a.mp4"), at("b.mp4")]));
+        let error = find(&["nowhere"]).unwrap_err().to_string();
+        assert!(error.contains("nowhere is no configuration, recording or folder; it does not exist"), "{error}");
+    }
+}
