@@ -287,7 +287,7 @@ mod tests {
             assert_eq!(error.kind, CaptureErrorKind::NotFound);
             let text = error.to_string();
             assert!(
-                text.starts_with(&format!("camera front: {named} is there; plug it in, or set nokhwa to")),
+                text.starts_with(&format!("camera front: {named} was found; plug it in, or set nokhwa to")),
                 "{text}"
             );
         }
@@ -302,7 +302,7 @@ mod tests {
         let error = found("0").unwrap_err();
         assert_eq!(
             error.to_string(),
-            "no camera with number 0 is there; plug it in, or set nokhwa to one of these: 3 \"B\", 2 \"A\", 1 \"B\""
+            "no camera with number 0 was found; plug it in, or set nokhwa to one of these: 3 \"B\", 2 \"A\", 1 \"B\""
         );
     }
 
