@@ -6,20 +6,9 @@ use clap::{Parser, Subcommand};
 use flyrig_training::TrainArgs;
 
 use crate::{
-    avatar::AvatarAction,
-    calibrate::CalibrateAction,
-    demo::DemoArgs,
-    eval::EvalArgs,
-    keys::KeysAction,
-    plate::PlateArgs,
-    recording::RecordArgs,
-    replay::ReplayArgs,
-    serve::ServeArgs,
-    sim_export::SimAction,
-    stream_recording::PlayArgs,
-    sync_check::SyncCheckArgs,
-    view::ViewArgs,
-    watch::WatchArgs,
+    avatar::AvatarAction, calibrate::CalibrateAction, demo::DemoArgs, eval::EvalArgs, keys::KeysAction,
+    plate::PlateArgs, recording::RecordArgs, replay::ReplayArgs, serve::ServeArgs, sim_export::SimAction,
+    stream_recording::PlayArgs, sync_check::SyncCheckArgs, view::ViewArgs, watch::WatchArgs,
 };
 
 /// Live free-viewpoint video of a person from a few cameras.

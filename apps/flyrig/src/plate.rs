@@ -17,10 +17,7 @@ use flyrig_takes::{Needs, TakeOptions, dataset};
 use flyrig_tracker::{PoseNet, shows_person};
 use flyrig_types::{CameraId, Frame, Image, PixelFormat};
 
-use crate::{
-    arguments::TargetArgs,
-    opening::open_take,
-};
+use crate::{arguments::TargetArgs, opening::open_take};
 
 /// Arguments of `flyrig plate`.
 #[derive(Debug, Args)]
