@@ -153,7 +153,7 @@ impl<'a> Evaluation<'a> {
             bar.inc(1);
         }
         bar.finish_and_clear();
-        let dataset = self.args.dataset.display();
+        let dataset = self.args.take.dataset.display();
         ensure!(self.processed > 0, "no frame of {dataset} could be used; run with -v to see why");
         Ok(())
     }

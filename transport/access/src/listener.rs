@@ -82,7 +82,7 @@ impl ConnectionPlace {
     /// Ends the handshake: the connection does not count against its address any more.
     pub fn established(&mut self) {
         if let Some((limits, address)) = self.handshake.take() {
-            lock(limits).end(address);
+            lock(&limits).end(address);
         }
     }
 }

@@ -8,8 +8,7 @@ use std::{
 use anyhow::{Context, Result};
 use clap::{Args, ValueEnum as _, builder::TypedValueParser as _};
 use flyrig_fusion::{
-    AppearanceMode, AppearanceOptions, BodySettings, GivenPerception, NetworksOn, PersonId, SessionBuilder,
-    SessionSettings,
+    AppearanceMode, AppearanceOptions, BodySettings, GivenPerception, PersonId, SessionBuilder, SessionSettings,
 };
 use flyrig_gpu::GpuContext;
 use flyrig_metrics::{ScoreSheet, score_view};
@@ -43,12 +42,6 @@ pub struct BenchAppearanceArgs {
     /// Weights files for the learned modes, in place of all networks that come with flyrig; may be repeated.
     #[arg(long)]
     pub weights: Vec<PathBuf>,
-    /// Largest change of an input for which the result of the networks is reused in the next frame; 0 recomputes everything.
-    #[arg(long, default_value_t = 0.0)]
-    pub reuse: f32,
-    /// Where the networks run; "adapter" needs a program that was built with the feature gpu-networks.
-    #[arg(long, value_enum, default_value = "processor")]
-    pub networks_on: NetworksOn,
     #[command(flatten)]
     pub output: OutputArgs,
     #[command(flatten)]

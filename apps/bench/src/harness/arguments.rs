@@ -4,10 +4,8 @@ use std::{ops::Range, path::Path};
 
 use clap::Args;
 use flyrig_fusion::{BodySettings, BudgetSettings, Origin, PerceptionSettings, SessionSettings};
-use flyrig_report::{
-    ReplaySettings,
-    arguments::{FpsArgs, parse_fps, parse_range, parse_size},
-};
+use flyrig_report::arguments::{FpsArgs, parse_fps, parse_range, parse_size};
+use flyrig_takes::ReplaySettings;
 
 /// Frames and cameras of recorded data sets.
 #[derive(Debug, Args)]
@@ -32,7 +30,6 @@ impl RecordedArgs {
         let body = BodySettings { gaussians, ..BodySettings::default() };
         ReplaySettings {
             dataset: dataset.to_owned(),
-            recorded: None,
             inputs: self.inputs.clone(),
             holdout: self.holdout.clone(),
             session: SessionSettings { perception, body, budget, ..SessionSettings::default() },

@@ -71,9 +71,9 @@ impl Form for StreamForm {
         let PersonMessages { motion, colors, .. } = encoder.encode(frame)?;
         let encode_ms = start.millis();
         let start = Start::now();
-        person.take_motion(&motion, 0.0)?;
+        person.ingest_motion(&motion, 0.0)?;
         for layer in &colors {
-            person.take_colors(layer)?;
+            person.ingest_colors(layer)?;
         }
         let received = person.motion_at(0.0, false).context("no motion was received")?;
         let mut posed = Posed::default();
@@ -123,7 +123,7 @@ impl Form for AvatarPoses {
         let motion = encoder.encode(&frame)?.motion;
         let encode_ms = start.millis();
         let start = Start::now();
-        self.person.take_motion(&motion, 0.0)?;
+        self.person.ingest_motion(&motion, 0.0)?;
         let received = self.person.motion_at(0.0, false).context("no motion was received")?;
         let decode_ms = start.millis();
         let start = Start::now();

@@ -163,7 +163,7 @@ impl Preview {
 
 /// Avatar that is being fitted.
 struct Building<'a> {
-    args: &'a BuildArgs,
+    args: &'a AvatarBuildArgs,
     fit: Fit,
     avatar: Avatar,
     preview: Preview,
@@ -181,7 +181,7 @@ struct Building<'a> {
 
 impl<'a> Building<'a> {
     /// Starts the fit, or resumes it from its checkpoint.
-    fn start(args: &'a BuildArgs, mut fit: Fit, mut avatar: Avatar, preview: Preview) -> Result<Self> {
+    fn start(args: &'a AvatarBuildArgs, mut fit: Fit, mut avatar: Avatar, preview: Preview) -> Result<Self> {
         let state = Checkpoint::new(args, fit.images());
         let (done, total) = match state.resume(&mut fit, &mut avatar)? {
             Some(progress) => (progress.done, Some(progress.total)),
@@ -200,7 +200,6 @@ impl<'a> Building<'a> {
             println!("stopped after {} of {total} steps; the same command goes on from there", self.done);
         }
         let seconds = self.started.elapsed().as_secs_f64();
-        self.print_skipped();
         let training_db = self.fit.decibels(&self.avatar)?;
         self.avatar.card = self.card(numbers, training_db);
         self.avatar.save(&self.args.out)?;
@@ -259,22 +258,11 @@ impl<'a> Building<'a> {
         ((self.args.minutes * 60.0 / step_secs) as u64).max(self.done)
     }
 
-    /// Prints which part of the images was skipped because its error had converged.
-    fn print_skipped(&self) {
-        let Drawn { images, left_out, rows: [rows, all] } = self.fit.drawn();
-        if left_out > 0 || rows < all {
-            println!(
-                "{images} images drawn and {left_out} left out, {:.0} % of the rows drawn, as their errors did not change",
-                100.0 * rows as f64 / all.max(1) as f64
-            );
-        }
-    }
-
     fn card(&self, frames: [u64; 2], training_db: f64) -> Card {
         let take = &self.args.take;
         Card {
             name: take.dataset.file_name().map_or_else(String::new, |name| name.to_string_lossy().into_owned()),
-            method: method(self.args),
+            method: method(self.args.method, &LocalSettings::default()),
             cameras: take.inputs.clone(),
             frames,
             pose: format!("{:?}", take.perception.pose).to_lowercase(),

@@ -83,7 +83,7 @@ pub fn eval(args: &AvatarEvalArgs, gpu: &GpuContext) -> Result<()> {
 
 /// Scores and cost of an avatar's views, collected frame by frame.
 struct Evaluation<'a> {
-    args: &'a EvalArgs,
+    args: &'a AvatarEvalArgs,
     scene: DetailedScene,
     scores: ScoreSheet,
     /// Scores of head and hands.
@@ -173,7 +173,7 @@ impl Evaluation<'_> {
         let metrics = Metrics {
             avatar: args.avatar.display().to_string(),
             inputs: &args.take.inputs,
-            holdout: &args.holdout,
+            holdout: &args.holdout.holdout,
             deformed: args.deformed,
             gaussians: self.scene.avatar().gaussians(),
             mean_drawn: cost.gaussians as f64 / f64::from(cost.views),

@@ -24,7 +24,7 @@ use super::{
     rig::{self, PAGE, RigTarget},
     views::{BoardTakeArgs, SeenBoards, open_frames},
 };
-use crate::cli::{CalibrateLiveArgs, TakeArgs};
+use crate::arguments::{BoardArgs, SolveArgs, TargetArgs};
 
 /// Arguments of `flyrig calibrate live`.
 #[derive(Debug, Args)]

@@ -42,9 +42,9 @@ const BATCH: usize = 16;
 const PATIENCE_SECS: f64 = 15.0;
 
 /// Opens the frames of a take. `gpu` opens a graphics adapter, for simulated cameras alone.
-pub fn open_frames(args: &TakeArgs, gpu: &dyn Fn() -> Result<GpuContext>) -> Result<Take> {
-    let options = TakeOptions { fps: args.fps, needs: Needs::Frames, ..TakeOptions::default() };
-    open_take(&args.input, &options, gpu)
+pub fn open_frames(args: &BoardTakeArgs, gpu: &dyn Fn() -> Result<GpuContext>) -> Result<Take> {
+    let options = TakeOptions { fps: args.source.rate.fps, needs: Needs::Frames, ..TakeOptions::default() };
+    open_take(&args.source.input, &options, gpu)
 }
 
 /// Boards that were seen in a take.
@@ -62,7 +62,7 @@ pub struct SeenBoards {
 
 impl SeenBoards {
     /// Opens a take and detects the board, which every camera must see. `gpu` opens a graphics adapter, for simulated cameras alone.
-    pub fn find(args: &TakeArgs, board: &Board, gpu: &dyn Fn() -> Result<GpuContext>) -> Result<Self> {
+    pub fn find(args: &BoardTakeArgs, board: &Board, gpu: &dyn Fn() -> Result<GpuContext>) -> Result<Self> {
         let bar = progress_bar((args.secs * 1e3) as u64, "boards, ms of the take");
         let seen = Self::detect_all(open_frames(args, gpu)?, board, args, |seen, at| {
             bar.set_position((at * 1e3) as u64);
@@ -78,7 +78,7 @@ impl SeenBoards {
     pub fn detect_all(
         take: Take,
         board: &Board,
-        args: &TakeArgs,
+        args: &BoardTakeArgs,
         mut each: impl FnMut(&Self, f64) -> Result<ControlFlow<()>>,
     ) -> Result<Self> {
         let (secs, every_nanos) = (args.secs, args.every_ms * 1e6);
