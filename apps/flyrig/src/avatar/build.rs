@@ -182,7 +182,7 @@ struct Building<'a> {
 impl<'a> Building<'a> {
     /// Starts the fit, or resumes it from its checkpoint.
     fn start(args: &'a AvatarBuildArgs, mut fit: Fit, mut avatar: Avatar, preview: Preview) -> Result<Self> {
-        let state = Checkpoint::new(args, fit.images());
+        let state = Checkpoint::new(&args.out, format!("{} images, {args:?}", fit.images()));
         let (done, total) = match state.resume(&mut fit, &mut avatar)? {
             Some(progress) => (progress.done, Some(progress.total)),
             None => (0, args.steps),

@@ -1,12 +1,10 @@
 //! Checkpoint of a build beside its avatar, from which the same command resumes after it was killed.
 
-use std::path::PathBuf;
+use std::path::{Path, PathBuf};
 
 use anyhow::{Context as _, Result};
 use flyrig_avatar::{Avatar, Fit, FitProgress};
 use flyrig_report::write_whole;
-
-use super::build::AvatarBuildArgs;
 
 /// Ending of the file's name.
 const ENDING: &str = "fit";
@@ -19,9 +17,9 @@ pub(super) struct Checkpoint {
 }
 
 impl Checkpoint {
-    /// Returns the checkpoint beside the avatar that is built from this number of images.
-    pub fn new(args: &AvatarBuildArgs, images: usize) -> Self {
-        Self { path: args.out.with_extension(ENDING), settings: format!("{images} images, {args:?}") }
+    /// Returns the checkpoint beside an avatar. `settings` describes everything that the result depends on.
+    pub fn new(avatar: &Path, settings: String) -> Self {
+        Self { path: avatar.with_extension(ENDING), settings }
     }
 
     /// Resumes from the file if there is one of the same build; ignores that of another build with a warning.
