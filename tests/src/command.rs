@@ -1,10 +1,10 @@
-//! Running the command under test.
+//! Execution of the command under test.
 
 use std::{path::Path, process::Command};
 
 use anyhow::{Context, Result};
 
-/// What a finished command said.
+/// Result of a finished command.
 #[derive(Debug)]
 pub struct Finished {
     /// Exit code; `None` when a signal ended it.
@@ -15,10 +15,10 @@ pub struct Finished {
     pub stderr: String,
 }
 
-/// Runs `program` to its end. `program` is `env!("CARGO_BIN_EXE_flyrig-under-test")`, which only tests know.
+/// Runs `program` to completion. Pass `env!("CARGO_BIN_EXE_flyrig-under-test")`, which is defined in tests only.
 ///
 /// # Errors
-/// When it cannot be started.
+/// Fails when the program cannot be started.
 pub fn run(program: &str, args: &[&str], folder: &Path) -> Result<Finished> {
     let output = Command::new(program)
         .args(args)

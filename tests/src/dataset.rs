@@ -1,4 +1,4 @@
-//! A small data set in EasyMocap layout, made by the simulator.
+//! Small simulated data set in EasyMocap layout.
 
 use std::path::PathBuf;
 
@@ -9,53 +9,53 @@ use tempfile::TempDir;
 
 /// Side of the images, pixels.
 pub const SIDE: u32 = 160;
-/// Frames a camera, 30 a second.
+/// Frames per camera, at 30 frames per second.
 pub const FRAMES: u64 = 6;
 
-/// A data set that vanishes when dropped.
+/// Data set that is deleted when dropped.
 #[derive(Debug)]
 pub struct Dataset {
-    /// Its folder.
+    /// Folder of the data set.
     pub root: PathBuf,
     folder: TempDir,
 }
 
 impl Dataset {
-    /// A folder beside the data set for results.
+    /// Returns a folder beside the data set, for results.
     #[must_use]
     pub fn out(&self) -> PathBuf {
         self.folder.path().join("out")
     }
 
-    /// Path of an image.
+    /// Returns the path of an image.
     #[must_use]
     pub fn picture(&self, camera: &str, frame: u64) -> PathBuf {
         self.root.join(format!("images/{camera}/{frame:06}.png"))
     }
 
-    /// Path of a mask.
+    /// Returns the path of a mask.
     #[must_use]
     pub fn mask(&self, camera: &str, frame: u64) -> PathBuf {
         self.root.join(format!("mask/{camera}/{frame:06}.png"))
     }
 }
 
-/// [`write_dataset_of`] the first person.
+/// Calls [`write_dataset_of`] with the first seed.
 ///
 /// # Errors
-/// See there.
+/// Fails as [`write_dataset_of`] does.
 pub fn write_dataset() -> Result<Dataset> {
     write_dataset_of(1)
 }
 
-/// Exports a simulated capture of the person of a seed before seven cameras, without the truth.
+/// Exports a simulated capture of the person with this seed by seven cameras, without ground truth.
 ///
 /// # Errors
-/// When there is no adapter or the folder cannot be written.
+/// Fails when there is no graphics adapter or the folder cannot be written.
 pub fn write_dataset_of(seed: u64) -> Result<Dataset> {
     let gpu = GpuContext::new(&AdapterChoice::Best)?;
     let mut config = SimConfig { seed, width: SIDE, height: SIDE, texture_px: 256, ..SimConfig::default() };
-    // A fast turn, so that few frames show all sides.
+    // Turn fast, so that few frames show every side.
     config.motion.turn_secs = 2.0;
     let mut simulator = Simulator::new(&gpu, &config)?;
     let folder = tempfile::tempdir()?;

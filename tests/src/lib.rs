@@ -1,4 +1,4 @@
-//! What the end-to-end tests share: a small simulated data set on disk, and running the command on it.
+//! Shared parts of the end-to-end tests: a small simulated data set on disk, and execution of the command.
 
 mod command;
 mod dataset;

@@ -1,8 +1,8 @@
-//! A program beside a test.
+//! Background process of a test.
 
 use std::process::Child;
 
-/// Ends the process when the test ends, however it does.
+/// Guard that kills the process when the test ends, also by a panic.
 #[derive(Debug)]
 pub struct Running(pub Child);
 

@@ -1,10 +1,10 @@
-//! Crates depend on crates of their own area or of areas below it (ARCHITECTURE.md, "Areas").
+//! Dependency direction: crates depend only on crates of their own area or of areas below it (ARCHITECTURE.md, "Areas").
 #![allow(clippy::unwrap_used, clippy::panic)] // a test may fail by panicking, in its helpers too
 
 use std::collections::BTreeMap;
 use std::path::Path;
 
-/// Each area with the areas that its crates may depend on besides itself.
+/// Areas, each with the other areas that its crates may depend on.
 const AREAS: [(&str, &[&str]); 11] = [
     ("base", &[]),
     ("capture", &["base"]),
@@ -19,7 +19,7 @@ const AREAS: [(&str, &[&str]); 11] = [
     ("tests", &["base", "capture", "calib", "renderer", "transport", "tracker", "sim", "viewer", "rig", "apps"]),
 ];
 
-/// Manifest path of each workspace member, relative to the root, by package name.
+/// Returns the folder of each workspace member, relative to the root, by package name.
 fn members(root: &Path) -> BTreeMap<String, String> {
     let manifest: toml::Table = std::fs::read_to_string(root.join("Cargo.toml")).unwrap().parse().unwrap();
     let folders = manifest["workspace"]["members"].as_array().unwrap();
@@ -35,7 +35,7 @@ fn package(manifest: &toml::Table) -> String {
     manifest["package"]["name"].as_str().unwrap().to_owned()
 }
 
-/// Names of all dependencies: of the library, its tests, its build script and single targets.
+/// Returns the names of all dependencies: of the library, its tests, its build script and single targets.
 fn dependencies(manifest: &toml::Table) -> Vec<String> {
     let mut tables = vec![manifest];
     if let Some(targets) = manifest.get("target").and_then(toml::Value::as_table) {
@@ -50,7 +50,7 @@ fn area(folder: &str) -> &str {
     folder.split('/').next().unwrap_or(folder)
 }
 
-/// Dependencies that point against the direction of the areas.
+/// Returns the dependencies that violate the direction of the areas.
 fn violations(members: &BTreeMap<String, String>, uses: impl Fn(&str) -> Vec<String>) -> Vec<String> {
     let mut found = Vec::new();
     for (name, folder) in members {

@@ -1,4 +1,4 @@
-//! Avatars are built from a take, scored, driven by a motion, exported; what cannot be is named.
+//! Avatars: built from a take, scored, driven by a motion, edited and exported; every unsupported input has a named error.
 #![allow(clippy::unwrap_used, clippy::panic)] // a test may fail by panicking, in its helpers too
 
 mod support;
@@ -31,7 +31,7 @@ fn an_avatar_is_built_scored_driven_and_exported() {
     assert!(figures[1] > figures[0] + 1.0, "{}", built.stdout);
     assert_eq!(build("b.flyavatar", &["--steps", "60"]).code, Some(0));
     let bytes = |name: &str| std::fs::read(folder.path().join(name)).unwrap();
-    assert!(bytes("a.flyavatar") == bytes("b.flyavatar"), "the same steps gave other bytes");
+    assert!(bytes("a.flyavatar") == bytes("b.flyavatar"), "the same steps gave different bytes");
 
     let info = avatar(&["info", "a.flyavatar"]);
     assert!(info.stdout.contains("\"steps\": 60") && info.stdout.contains("4000 Gaussians"), "{}", info.stdout);
@@ -54,11 +54,11 @@ fn an_avatar_is_built_scored_driven_and_exported() {
         avatar(&["render", "a.flyavatar", "--motion", &motion, "--out", "r", "--frames", "0..2", "--size", "64x96"]);
     assert_eq!(drawn.code, Some(0), "{drawn:?}");
     let shown = image::open(folder.path().join("r/000001.png")).unwrap().to_rgba8();
-    assert!(shown.pixels().filter(|pixel| pixel.0[3] > 200).count() > 200, "nobody is in the image");
+    assert!(shown.pixels().filter(|pixel| pixel.0[3] > 200).count() > 200, "no person in the image");
     let exported = avatar(&["export", "a.flyavatar", "--out", "a.ply", "--motion", &motion]);
     assert!(exported.stdout.contains("4000 splats in a.ply"), "{exported:?}");
 
-    // Textures: untouched nothing changes, painted the avatar does.
+    // Textures: an untouched texture changes nothing, a painted one changes the avatar.
     let done = |args: &[&str]| {
         let finished = avatar(args);
         assert_eq!(finished.code, Some(0), "{finished:?}");
@@ -86,7 +86,7 @@ fn an_avatar_is_built_scored_driven_and_exported() {
     done(&["render", "a.flyavatar", "--motion", "tall.glb", "--out", "t", "--frames", "0..1", "--size", "64x96"]);
     assert!(done(&["export", "a.flyavatar", "--out", "a.glb"]).contains("4000 splats"));
 
-    // What cannot be.
+    // Unsupported inputs.
     let refused = |args: &[&str], expected: &str| {
         let finished = avatar(args);
         assert_eq!(finished.code, Some(1), "{finished:?}");
@@ -135,10 +135,10 @@ fn a_build_that_was_killed_goes_on() {
     killed.kill().unwrap(); // SIGKILL
     killed.wait().unwrap();
     assert!(state.exists(), "the build ended before it could be killed");
-    assert!(!folder.path().join("a.flyavatar").exists(), "an avatar of a build that was killed");
+    assert!(!folder.path().join("a.flyavatar").exists(), "a killed build left an avatar");
     let (printed, resumed) = build();
     assert!(printed.contains("going on after 500 of 700 steps"), "{printed}");
-    assert!(whole == resumed, "it ended with other bytes");
+    assert!(whole == resumed, "the resumed build gave different bytes");
     assert!(!state.exists());
 }
 
@@ -163,7 +163,7 @@ fn a_recording_gives_the_avatar_of_its_exported_folder() {
         flyrig(&[&args[..], &["--steps", "40", "--frames", "1..5"], more].concat())
     };
     let estimated = ["--pose", "estimated", "--masks", "estimated"];
-    // Names of cards are those of the takes. Calibration and timestamps are rounded in a folder, so that bytes may differ.
+    // Cards name their takes. A folder rounds calibration and timestamps, so the bytes may differ.
     let cards = ["take.mcap", "folder/take.mcap"].map(|take| {
         let built = build(take, "a.flyavatar", &estimated);
         assert_eq!(built.code, Some(0), "{built:?}");
@@ -176,7 +176,7 @@ fn a_recording_gives_the_avatar_of_its_exported_folder() {
     assert!(recorded == exported && recorded["frames"] == serde_json::json!([1, 5]), "{cards:?}");
     assert!(*of_recording > 30.0 && (of_recording - of_folder).abs() < 0.5, "{cards:?}");
 
-    // Held-out cameras of a recording are scored as those of its folder.
+    // Held-out cameras of a recording get the scores of its exported folder.
     let eval = |take: &str| {
         let args = ["avatar", "eval", "a.flyavatar", take, "--inputs", "00,02", "--holdout", "04", "--out", "e"];
         let scored = flyrig(&[&args[..], &["--frames", "2..4"], &estimated].concat());
@@ -212,7 +212,7 @@ fn the_live_rig_starts_from_an_avatar() {
     let built = flyrig(&[&args[..], &["--gaussians", "4000", "--nodes", "100", "--steps", "60"], &GIVEN].concat());
     assert_eq!(built.code, Some(0), "{built:?}");
 
-    // One camera sees the person; another one that nobody looked through is scored, in the first frame after the avatar's take.
+    // One camera sees the person; a held-out camera is scored in the first frame after the avatar's take.
     let eval = |more: &[&str]| {
         let args = ["eval", &take, "--inputs", "00", "--holdout", "03", "--frames", "4..5", "--out", "e"];
         flyrig(&[&args[..], &["--gaussians", "6000", "--nodes", "200"], &GIVEN, more].concat())
@@ -228,7 +228,7 @@ fn the_live_rig_starts_from_an_avatar() {
     let (without, with) = (score(&[]), score(&["--avatar", "a.flyavatar"]));
     assert!(with > without + 1.0, "{with} dB with the avatar, {without} without");
 
-    // A rig that runs, with the body and the poses of the take.
+    // A running rig with the body and the poses of the take.
     let endpoint = support::small_rig("avatars", folder.path(), "");
     let simulated = std::fs::read_to_string(folder.path().join("rig.toml")).unwrap();
     std::fs::write(folder.path().join("sim.toml"), format!("{}frames = 3\n", support::SMALL_SIM)).unwrap();
@@ -244,7 +244,7 @@ fn the_live_rig_starts_from_an_avatar() {
     assert_eq!(ran.code, Some(0), "{}", ran.stderr);
     assert!(ran.stderr.contains("the person starts from the avatar a.flyavatar"), "{}", ran.stderr);
 
-    // Viewers who draw the avatar themselves: it comes once, then poses alone.
+    // Viewers that draw the avatar themselves receive it once, then poses alone.
     let text = config.replace("nodes = 100\n", "nodes = 100\navatar = \"a.flyavatar\"\n");
     let text = text.replace("real_time = false\n", "fps = 0.5\n").replace("[output]\n", "[output]\navatar = true\n");
     std::fs::write(folder.path().join("rig.toml"), text).unwrap();
@@ -262,7 +262,7 @@ fn the_live_rig_starts_from_an_avatar() {
         let mut camera = state.rig.clone().unwrap().cameras[0].clone();
         camera.intrinsics.lens = flyrig_types::Lens::PINHOLE;
         let person = state.people.get_mut(0).unwrap();
-        assert_eq!(person.color_changes(), 0, "colours are sent beside the avatar");
+        assert_eq!(person.color_changes(), 0, "colours were sent beside the avatar");
         let motion = person.motion_at(clock_secs(), false).unwrap();
         assert!(motion.nodes.is_empty());
         let (mut posed, mut axes) = (Posed::default(), PosedAxes::default());
@@ -273,11 +273,11 @@ fn the_live_rig_starts_from_an_avatar() {
         scene.set_people([ShownPerson { posed: &posed, colors: &colors, axes: Some(&axes) }]).unwrap();
         let view = scene.draw(&camera).unwrap();
         let shown = view.rgba.chunks_exact(4).filter(|pixel| pixel[3] > 200).count();
-        assert!(shown > 300, "{shown} pixels show somebody");
+        assert!(shown > 300, "{shown} pixels show the person");
     }
     drop(receiver);
 
-    // Refusals: one line with the fix.
+    // Errors are one line with the fix.
     let refused = |finished: flyrig_tests::Finished, expected: &[&str]| {
         assert_eq!(finished.code, Some(1), "{finished:?}");
         let line = finished.stderr.lines().find(|line| line.starts_with("error:")).unwrap_or_default();
@@ -295,7 +295,7 @@ fn the_live_rig_starts_from_an_avatar() {
     let both = "avatar = \"a.flyavatar\"\nperson = \"me.person\"";
     refused(with(both), &["body.avatar (a.flyavatar) and body.person (me.person)", "leave one of them empty"]);
     refused(eval(&["--avatar", "none.flyavatar"]), &["body.avatar: none.flyavatar: "]);
-    // The simulator's own person has its joints in another order than an exported one.
+    // The simulator's person orders its joints differently from an exported one.
     let text = simulated.replace("nodes = 100\n", "nodes = 100\navatar = \"a.flyavatar\"\n");
     std::fs::write(folder.path().join("rig.toml"), text).unwrap();
     refused(flyrig(&["run", "rig.toml"]), &["body.avatar: ", "among its joints", "use the same body for both"]);

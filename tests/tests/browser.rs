@@ -1,5 +1,5 @@
-//! A real browser (Chromium without a window) at the web page of a rig: the image on its canvas is the one that the rig's own renderer
-//! draws. Ignored, since it needs Chromium: `make test-browser`.
+//! Web page of a rig in headless Chromium: its canvas shows the image that the rig's own renderer draws. Ignored by default, since
+//! the tests need Chromium: `make test-browser`.
 #![allow(clippy::unwrap_used, clippy::panic)] // a test may fail by panicking, in its helpers too
 
 mod support;
@@ -28,10 +28,10 @@ use tokio_tungstenite::tungstenite::{self, Message, WebSocket, client::IntoClien
 const PROGRAM: &str = env!("CARGO_BIN_EXE_flyrig-under-test");
 const SIDE: u32 = 512;
 const BACKGROUND: [u8; 3] = [27, 29, 32];
-/// JavaScript: the rig's frame number of the image on the page's canvas.
+/// JavaScript expression for the rig's frame number of the image on the canvas.
 const SHOWN_FRAME: &str = "Number(document.documentElement.dataset.frame)";
 
-/// A page, controlled by the browser's debugging protocol.
+/// Browser page, controlled through the debugging protocol.
 struct Browser {
     socket: WebSocket<TcpStream>,
     calls: u64,
@@ -76,7 +76,7 @@ impl Browser {
     }
 }
 
-/// WebSocket of the browser's first page.
+/// Returns the WebSocket address of the browser's first page.
 fn page_address(port: u16) -> Option<String> {
     let mut stream = TcpStream::connect(("127.0.0.1", port)).ok()?;
     write!(stream, "GET /json HTTP/1.1\r\nHost: 127.0.0.1:{port}\r\n\r\n").ok()?;
@@ -89,9 +89,9 @@ fn page_address(port: u16) -> Option<String> {
     page["webSocketDebuggerUrl"].as_str().map(str::to_owned)
 }
 
-/// Options of a browser whose WebGL2 a processor computes.
+/// Chromium options for WebGL2 on the processor.
 const WEBGL2: &[&str] = &["--use-angle=swiftshader"];
-/// The same for WebGPU.
+/// Chromium options for WebGPU on the processor.
 const WEBGPU: &[&str] = &[
     "--enable-unsafe-webgpu",
     "--enable-features=Vulkan",
@@ -128,12 +128,12 @@ fn a_browser_with_webgpu_shows_an_avatar_as_the_rig_draws_it() {
     assert!(psnr > 40.0, "{psnr} dB");
 }
 
-/// Who is shown.
+/// Subject that the page shows.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 enum Shown {
-    /// A simulated person, with colours of each frame.
+    /// Simulated person, with new colours in every frame.
     Person,
-    /// The avatar of the person of a data set, once and then poses.
+    /// Avatar of the person of a data set, sent once and then driven by poses.
     Avatar,
 }
 
@@ -142,7 +142,7 @@ impl Shown {
         if self == Self::Person { "person" } else { "avatar" }
     }
 
-    /// Writes `rig.toml` and returns its endpoint, and the data set where there is one.
+    /// Writes `rig.toml`; returns its endpoint and, for an avatar, its data set.
     fn configure(self, folder: &Path, web: u16) -> (String, Option<Dataset>) {
         let file = folder.join("rig.toml");
         if self == Self::Person {
@@ -162,7 +162,7 @@ impl Shown {
         assert_eq!(built.code, Some(0), "{built:?}");
         let endpoint = small_rig("browser", folder, "");
         let text = std::fs::read_to_string(&file).unwrap();
-        // Six frames that last until the browser has drawn one.
+        // Six frames at a low rate: the rig must still run when the browser has drawn one.
         let source = format!("[source]\nkind = \"folder\"\npath = {take:?}\nfps = 0.2\n");
         let text = text.replace("[source]\n", &source);
         let body = format!("[body]\ntemplate = {:?}\navatar = \"a.flyavatar\"\n", format!("{take}/subject.glb"));
@@ -172,8 +172,8 @@ impl Shown {
     }
 }
 
-/// Returns the PSNR of the page in a browser of these options against the rig's own drawing of the same motion and colours, on the pixels of
-/// the person, dB. The page draws with `drawing`, "webgl2" or "webgpu".
+/// Returns the PSNR of the page against the rig's renderer, for the same motion and colours and on the pixels of the person, dB.
+/// The page draws with `drawing`, "webgl2" or "webgpu".
 fn psnr_of_browser(who: Shown, drawing: &str, options: &[&str]) -> f64 {
     assert!(
         Command::new("chromium").arg("--version").output().is_ok(),
@@ -185,7 +185,7 @@ fn psnr_of_browser(who: Shown, drawing: &str, options: &[&str]) -> f64 {
     let (endpoint, _data) = who.configure(folder.path(), web);
     let start_rig = || Process::start(PROGRAM, &["run", "rig.toml"], folder.path(), "run");
     let listen = format!("127.0.0.1:{web}");
-    // The data set is short: its rig starts once the browser is there.
+    // The data set is short: start its rig once the browser is open.
     let _server = match who {
         Shown::Person => start_rig(),
         Shown::Avatar => {
@@ -205,7 +205,7 @@ fn psnr_of_browser(who: Shown, drawing: &str, options: &[&str]) -> f64 {
     browser.call("Emulation.setDeviceMetricsOverride", &size);
     let _rig = (who == Shown::Avatar).then(start_rig);
 
-    // Motions and colours by frame, as this program received them.
+    // Motions and colours by frame, as this test received them.
     let mut known: BTreeMap<u64, (Motion, Vec<[f32; 4]>)> = BTreeMap::new();
     let mut note = |receiver: &Receiver| {
         let mut state = receiver.state();
@@ -219,13 +219,13 @@ fn psnr_of_browser(who: Shown, drawing: &str, options: &[&str]) -> f64 {
         browser.evaluate("document.documentElement.dataset.ready") == "yes"
     });
     let seconds = started.elapsed().as_secs_f64();
-    // Some seconds more, so that every colour is refined.
+    // Wait a few seconds more, until every colour has been refined.
     let until = Instant::now() + Duration::from_secs(6);
     while Instant::now() < until {
         note(&receiver);
         std::thread::sleep(Duration::from_millis(20));
     }
-    // The frame on the screenshot is known where it is the same before and after.
+    // Accept a screenshot only if the frame number is the same before and after it.
     let (mut frame, mut encoded) = (0, String::new());
     wait_until("a screenshot between two frames", || {
         note(&receiver);
@@ -270,10 +270,10 @@ fn psnr_of_browser(who: Shown, drawing: &str, options: &[&str]) -> f64 {
     let psnr = psnr_of_person(&ours.rgba, &on_grey, browsers.as_raw());
     let mut notes = format!("{psnr:.2} dB on {count} pixels of the person");
     if who == Shown::Avatar {
-        // Drawing spheres would not do.
+        // Rendering plain spheres would not pass.
         let spheres = composite_over(&spheres.rgba, &behind);
         let without = psnr_of_person(&ours.rgba, &on_grey, &spheres);
-        notes += &format!(", spheres in place of its Gaussians {without:.2} dB");
+        notes += &format!(", spheres instead of Gaussians {without:.2} dB");
         assert!(without < 35.0 && psnr > without + 5.0, "{notes}");
     }
     println!("{drawing}: the {} {seconds:.1} s after the browser was started; {notes}", who.name());
@@ -285,7 +285,8 @@ fn psnr_of_browser(who: Shown, drawing: &str, options: &[&str]) -> f64 {
     psnr
 }
 
-/// Pixels that show the person in either image, of `rgba` and of RGB over the background: the background alone would flatter.
+/// Returns the pixels that show the person in `rgba` or in `rgb`, which is over the background. Background pixels would raise the
+/// score.
 fn of_person<'a>(rgba: &'a [u8], rgb: &'a [u8]) -> impl Iterator<Item = usize> + 'a {
     let pixels = rgba.chunks_exact(4).zip(rgb.chunks_exact(3)).enumerate();
     pixels.filter_map(|(at, (ours, theirs))| {
@@ -294,7 +295,7 @@ fn of_person<'a>(rgba: &'a [u8], rgb: &'a [u8]) -> impl Iterator<Item = usize> +
     })
 }
 
-/// PSNR of `theirs` against `on_grey`, which is `ours` over the background, on the pixels of the person, dB.
+/// Returns the PSNR of `theirs` against `on_grey` (`ours` over the background), on the pixels of the person, dB.
 fn psnr_of_person(ours: &[u8], on_grey: &[u8], theirs: &[u8]) -> f64 {
     let (mut sum, mut count) = (0.0, 0usize);
     for at in of_person(ours, theirs) {
@@ -311,7 +312,7 @@ fn psnr_of_person(ours: &[u8], on_grey: &[u8], theirs: &[u8]) -> f64 {
 
 #[test]
 #[ignore = "needs Chromium; make test-browser"]
-fn a_browser_without_webgl2_is_told_so() {
+fn a_browser_without_webgl2_shows_the_reason() {
     let folder = tempfile::tempdir().unwrap();
     let port = || std::net::TcpListener::bind("127.0.0.1:0").unwrap().local_addr().unwrap().port();
     let (web, debugging) = (port(), port());

@@ -1,4 +1,4 @@
-//! A stranger's way to a calibration: print a board, show it, calibrate lenses and rig, and get what the cameras are.
+//! Calibration from a printed board: lenses and rig are recovered from images of the board alone.
 #![allow(clippy::unwrap_used)] // helpers of tests
 
 use std::path::Path;
@@ -12,7 +12,7 @@ const PROGRAM: &str = env!("CARGO_BIN_EXE_flyrig-under-test");
 const SIZE: [u32; 2] = [640, 480];
 const BOARDS: u32 = 26;
 
-/// Three cameras on an arc of 1 m, with lenses of their own.
+/// Returns three cameras on an arc of 1 m, each with a different lens.
 fn cameras() -> Vec<Camera> {
     [("left", -0.6f64, 610.0), ("middle", 0.0, 640.0), ("right", 0.6, 590.0)]
         .into_iter()
@@ -35,10 +35,10 @@ fn cameras() -> Vec<Camera> {
         .collect()
 }
 
-/// Board number `i`: the first lies on the floor, the others are held up, tilted, in all parts of the images.
+/// Returns the pose of board `i`: the first lies on the floor, the others are held up, tilted, in all parts of the images.
 fn pose(board: &Board, i: u32) -> Isometry {
     let (a, b) = (f64::from(i) * 2.4, f64::from(i) * 1.7);
-    // Its face towards the cameras, which look along y and down.
+    // Faces the cameras, which look along y and down.
     let upright = DQuat::from_rotation_x(-2.0);
     let (turn, middle) = if i == 0 {
         (DQuat::from_rotation_x(-std::f64::consts::PI) * DQuat::from_rotation_z(0.1), DVec3::new(0.0, -0.1, 0.0))
@@ -90,7 +90,7 @@ fn a_printed_board_calibrates_lenses_and_rig() {
         assert!(height.abs() < 0.01, "{}: {height} m above the true height", truth.id);
     }
 
-    // The same with hints on the way, from the boards that differ.
+    // `calibrate live` gives the same result, with hints, from boards in different poses.
     let live = command("calibrate live take --fps 1 --lenses lenses --out live --floor --listen 127.0.0.1:0");
     assert_eq!(live.code, Some(0), "{}{}", live.stdout, live.stderr);
     assert!(live.stderr.contains("progress at http://127.0.0.1:") && live.stderr.contains("next: "), "{}", live.stderr);
@@ -107,7 +107,7 @@ fn a_printed_board_calibrates_lenses_and_rig() {
     );
     assert!(!page.contains("NaN") && !page.contains("http"), "complete and self-contained");
 
-    // Nothing is replaced unasked, and what is wrong is said in one line.
+    // Nothing is overwritten without --force, and each error is one line.
     let again = command("calibrate rig take --fps 1 --lenses lenses --out calibration");
     assert_eq!(again.code, Some(1));
     assert!(again.stderr.contains("calibration.toml is there already; --force replaces it"), "{}", again.stderr);

@@ -1,4 +1,4 @@
-//! A rig whose calibration is a degree off, and whose cameras differ in colour, is mended by a person who walks before it.
+//! Recalibration from a walking person: a pose error of one degree and colour differences between cameras are corrected.
 #![allow(clippy::unwrap_used)] // helpers of tests
 
 use flyrig_calib::{load_calibration, testing::rig_errors};
@@ -12,7 +12,7 @@ const SIM: &str = "seed = 511\nwidth = 256\nheight = 256\n[motion]\nkind = \"wal
                    [[sensors]]\n[[sensors]]\n";
 
 #[test]
-fn somebody_who_walks_mends_the_calibration() {
+fn a_walking_person_corrects_the_calibration() {
     let folder = tempfile::tempdir().unwrap();
     let command = |text: &str| run(PROGRAM, &text.split(' ').collect::<Vec<_>>(), folder.path()).unwrap();
     std::fs::write(folder.path().join("sim.toml"), SIM).unwrap();
@@ -32,7 +32,7 @@ fn somebody_who_walks_mends_the_calibration() {
     assert!(before > 4.0 && after < 0.3 * before, "{before} px before, {after} px after\n{}", person.stdout);
     assert!(person.stdout.contains("was off: the person lies"), "{}", person.stdout);
 
-    // The second camera's colours are brought to those of the others.
+    // The colours of the second camera are matched to those of the others.
     let color = command("calibrate color take --calibration better --secs 2 --out matched");
     assert_eq!(color.code, Some(0), "{}{}", color.stdout, color.stderr);
     let matched = load("matched");
@@ -43,7 +43,7 @@ fn somebody_who_walks_mends_the_calibration() {
         assert!(off.abs() < 0.06, "channel {k}: {:.1} % off\n{}", 100.0 * off, color.stdout);
     }
 
-    // What is wrong is said in one line, and nothing is written.
+    // Each error is one line, and nothing is written.
     let again = command("calibrate person take --out better");
     assert_eq!(again.code, Some(1));
     assert!(again.stderr.contains("calibration.toml is there already; --force replaces it"), "{}", again.stderr);

@@ -1,4 +1,4 @@
-//! The command explains itself and refuses what it cannot do.
+//! Command line: help, printed configurations, and errors for unsupported input.
 #![allow(clippy::unwrap_used, clippy::panic)] // a test may fail by panicking, in its helpers too
 
 use flyrig_tests::run;
@@ -106,7 +106,7 @@ fn a_demo_goes_through_every_fault_of_a_rig() {
             .map(|drop| drop[1].as_u64().unwrap())
             .sum()
     };
-    // Camera 05 hangs for 3 frames, which is no error yet, and is gone for 8; some frames of 00 cannot be decoded.
+    // Camera 05 stalls for 3 frames, which is no error yet, and is disconnected for 8; some frames of 00 cannot be decoded.
     assert!(count("errors of 05") == 8 && count("errors of 00") >= 1, "{drops:?}");
     assert!(count("sets without a camera") >= 11, "{drops:?}");
     let wrong = std::fs::write(folder.path().join("bad.toml"), "[[fault]]\nkind = \"drop\"\nmm = 3\n");

@@ -1,4 +1,4 @@
-//! A damaged data set gives one clear line and a failing exit, or costs the one image that is damaged.
+//! Damaged data sets: the command fails with one clear line, or loses only the damaged image.
 #![allow(clippy::unwrap_used, clippy::panic)] // a test may fail by panicking, in its helpers too
 
 use flyrig_tests::{Dataset, FRAMES, Finished, run, write_dataset};
@@ -13,7 +13,7 @@ fn eval(data: &Dataset, extra: &[&str]) -> Finished {
     run(PROGRAM, &args, data.root.parent().unwrap()).unwrap()
 }
 
-/// Fails with this text, says nothing else, leaves no results.
+/// Asserts that the command failed with this text alone and left no results.
 fn assert_refused(data: &Dataset, finished: &Finished, expected: &str) {
     assert_eq!(finished.code, Some(1), "{finished:?}");
     assert!(finished.stderr.contains(expected), "expected '{expected}' in: {}", finished.stderr);
@@ -22,14 +22,14 @@ fn assert_refused(data: &Dataset, finished: &Finished, expected: &str) {
 }
 
 #[test]
-fn a_missing_camera_is_named_with_those_there_are() {
+fn a_missing_camera_is_named_with_the_existing_ones() {
     let data = write_dataset().unwrap();
     std::fs::remove_dir_all(data.root.join("images/02")).unwrap();
     let finished = eval(&data, &[]);
     assert_refused(&data, &finished, "02");
     assert!(finished.stderr.contains("00"), "lists what there is: {}", finished.stderr);
 
-    // Nor is it put down to the calibration when that says nothing of the images' sizes.
+    // A calibration without image sizes gives the same error.
     let intri = data.root.join("intri.yml");
     let text = std::fs::read_to_string(&intri).unwrap();
     let sizeless: Vec<&str> = text.lines().filter(|line| !line.starts_with("H_") && !line.starts_with("W_")).collect();
@@ -58,7 +58,7 @@ fn a_truncated_image_costs_that_image() {
     assert!(finished.stderr.contains("camera 02") && finished.stderr.contains("going on"), "{}", finished.stderr);
     let metrics: serde_json::Value =
         serde_json::from_slice(&std::fs::read(data.out().join("metrics.json")).unwrap()).unwrap();
-    assert_eq!(metrics["frames"], FRAMES, "every frame was rendered");
+    assert_eq!(metrics["frames"], FRAMES, "every frame must be rendered");
     assert_eq!(metrics["sync"]["partial"], 1);
     assert_eq!(metrics["sync"]["broken_images"], 1);
 }
@@ -94,7 +94,7 @@ fn nan_in_the_calibration_is_refused_by_file_and_camera() {
     let data = write_dataset().unwrap();
     let path = data.root.join("intri.yml");
     let text = std::fs::read_to_string(&path).unwrap();
-    // The first number of the first camera matrix.
+    // Replace the first number of the first camera matrix.
     let start = text.find("K_00").unwrap();
     let data_at = start
         + text[start..].find("data:").unwrap()
@@ -108,7 +108,7 @@ fn nan_in_the_calibration_is_refused_by_file_and_camera() {
 }
 
 #[test]
-fn other_mistakes_are_told_in_one_line() {
+fn other_mistakes_are_reported_in_one_line() {
     let data = write_dataset().unwrap();
     let both = eval(&data, &["--holdout", "02"]);
     assert_ne!(both.code, Some(0));

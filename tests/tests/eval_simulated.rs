@@ -1,12 +1,12 @@
-//! Simulated cameras in, the held-out ones come out like the truth, and each part of the method earns its place.
+//! Evaluation on simulated cameras: held-out views match the ground truth, and every part of the method improves the scores.
 #![allow(clippy::unwrap_used, clippy::panic)] // a test may fail by panicking, in its helpers too
 
 use flyrig_tests::{Dataset, FRAMES, SIDE, run, write_dataset_of};
 
 const PROGRAM: &str = env!("CARGO_BIN_EXE_flyrig-under-test");
-/// People of the first seeds, as they come: what helps one may cost another a hair's breadth.
+/// Seeds of the simulated people. Scores are averaged: a part may cost a single person slightly.
 const SEEDS: [u64; 4] = [1, 2, 3, 4];
-/// The method without its parts, then with one after the other.
+/// Appearance mode and solver, from the bare method to the complete one, one part at a time.
 const STEPS: [[&str; 2]; 4] =
     [["direct-no-space-time", "none"], ["direct-no-time", "none"], ["direct", "none"], ["direct", "gauss-newton"]];
 
@@ -22,7 +22,7 @@ fn eval(data: &Dataset, inputs: &str, [mode, solver]: [&str; 2]) -> serde_json::
 #[test]
 fn held_out_views_are_predicted_and_no_part_of_the_method_loses() {
     let people = SEEDS.map(|seed| write_dataset_of(seed).unwrap());
-    // A single view, where most of the person is unseen, and three.
+    // One view, which leaves most of the person unseen, and three views.
     for inputs in ["00", "00,02,05"] {
         let steps = STEPS.map(|step| {
             let scores: Vec<[f64; 4]> = people
@@ -45,7 +45,7 @@ fn held_out_views_are_predicted_and_no_part_of_the_method_loses() {
         assert!(inputs == "00" || (full[0] > 22.0 && full[3] > 0.85), "{full:?}");
     }
 
-    // What was promised lies in the folder.
+    // The folder holds the documented files.
     let data = &people[0];
     let picture = image::open(data.out().join("03/000002.png")).unwrap();
     assert_eq!((picture.width(), picture.height(), picture.color()), (SIDE, SIDE, image::ColorType::Rgba8));

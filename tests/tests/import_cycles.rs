@@ -1,10 +1,11 @@
-//! Files of one crate do not import each other in a cycle (CONTRIBUTING.md). Re-exports and the crate's root do not count.
+//! Import cycles: the files of a crate do not import each other in a cycle (CONTRIBUTING.md). Re-exports and the crate's root are
+//! exempt.
 #![allow(clippy::unwrap_used, clippy::panic)] // a test may fail by panicking, in its helpers too
 
 use std::collections::{BTreeMap, BTreeSet};
 use std::path::{Path, PathBuf};
 
-/// Module path of each file below `src`, such as `["deform", "track"]`, without tests and crate roots.
+/// Returns the module path of each file below `src`, such as `["deform", "track"]`, without tests and crate roots.
 fn modules(src: &Path) -> BTreeMap<Vec<String>, PathBuf> {
     let mut found = BTreeMap::new();
     let mut folders = vec![src.to_owned()];
@@ -32,7 +33,7 @@ fn modules(src: &Path) -> BTreeMap<Vec<String>, PathBuf> {
     found
 }
 
-/// Source without line comments, inline tests and re-exports.
+/// Returns the source without line comments, inline tests and re-exports.
 fn code(path: &Path) -> String {
     let text = std::fs::read_to_string(path).unwrap();
     let production = text.split("\n#[cfg(test)]\nmod tests {").next().unwrap_or_default().to_owned();
@@ -47,7 +48,7 @@ fn code(path: &Path) -> String {
     code
 }
 
-/// Expands `a::{b, c::{d, e}}` at the beginning of `text` into its paths.
+/// Expands `a::{b, c::{d, e}}` at the start of `text` into its paths.
 fn paths(text: &str) -> Vec<Vec<String>> {
     let mut found = Vec::new();
     expand(&mut text.chars().peekable(), Vec::new(), &mut found);
@@ -83,7 +84,7 @@ fn expand(text: &mut std::iter::Peekable<std::str::Chars<'_>>, mut head: Vec<Str
     }
 }
 
-/// Modules that `module` imports: by `crate::`, `super::`, `self::` or the name of a child.
+/// Returns the modules that `module` imports: by `crate::`, `super::`, `self::` or the name of a child.
 fn imports(module: &[String], code: &str, all: &BTreeMap<Vec<String>, PathBuf>) -> BTreeSet<Vec<String>> {
     let mut starts = vec!["crate".to_owned(), "super".to_owned(), "self".to_owned()];
     starts.extend(
@@ -121,7 +122,7 @@ fn imports(module: &[String], code: &str, all: &BTreeMap<Vec<String>, PathBuf>) 
     found
 }
 
-/// Modules that reach themselves through imports.
+/// Returns the modules that reach themselves through imports.
 fn in_cycles(edges: &BTreeMap<Vec<String>, BTreeSet<Vec<String>>>) -> Vec<String> {
     let reaches_itself = |start: &Vec<String>| {
         let mut seen = BTreeSet::new();
@@ -152,7 +153,7 @@ fn no_file_imports_itself_through_others() {
         let edges = all.iter().map(|(module, path)| (module.clone(), imports(module, &code(path), &all))).collect();
         cycles.extend(in_cycles(&edges).into_iter().map(|module| format!("{member}: {module}")));
     }
-    assert!(files > 400, "the walk finds the files: {files}");
+    assert!(files > 400, "too few files found: {files}");
     assert!(cycles.is_empty(), "{cycles:#?}");
 }
 

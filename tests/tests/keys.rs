@@ -1,4 +1,4 @@
-//! Keys from the command line: whoever was given one watches or sends cameras with that file alone.
+//! Keys from the command line: a key file alone lets another computer watch the rig or send cameras.
 #![allow(clippy::unwrap_used, clippy::panic)] // a test may fail by panicking, in its helpers too
 
 use std::{
@@ -10,7 +10,7 @@ use flyrig_tests::{Running, run};
 
 const PROGRAM: &str = env!("CARGO_BIN_EXE_flyrig-under-test");
 
-/// A port that is free, and so is the next.
+/// Returns a free port whose successor is free too.
 fn free_port() -> u16 {
     let port = || TcpListener::bind("0.0.0.0:0").unwrap().local_addr().unwrap().port();
     (0..100).map(|_| port()).find(|port| TcpListener::bind(("0.0.0.0", port + 1)).is_ok()).unwrap()
@@ -53,7 +53,7 @@ fn a_key_file_is_all_that_another_computer_needs() {
     refused(&["watch", "cameras.toml", "--seconds", "1"], "cameras.toml: is no key");
     refused(&["watch", "desk.key", "--record", "x.mcap", "--seconds", "5"], "nobody answers at 127.0.0.1");
 
-    // The cameras' computer knows the rig from its key, and listens nowhere.
+    // The camera computer gets the rig's address from its key, and does not listen.
     let mut cameras = Command::new(PROGRAM);
     cameras.args(["capture", "cameras.toml", "--key", "left-pc.key"]).current_dir(folder.path()).stderr(Stdio::null());
     let cameras = Running(cameras.spawn().unwrap());
@@ -72,9 +72,9 @@ fn a_key_file_is_all_that_another_computer_needs() {
         let replayed = command(&["replay", &take(n)]).stdout;
         replayed.lines().find_map(|line| line.strip_prefix("sets: ")?.split(' ').next()?.parse::<usize>().ok())
     };
-    assert!((0..8).filter_map(sets).any(|complete| complete > 3), "no sets came");
+    assert!((0..8).filter_map(sets).any(|complete| complete > 3), "no frame sets arrived");
 
-    // Away, and back with a new key.
+    // Revoke the key, then renew it.
     done(&["keys", "revoke", "left-pc"]);
     assert!(
         done(&["keys", "list"]).stdout.lines().any(|line| line.starts_with("left-pc") && line.ends_with("revoked"))

@@ -1,4 +1,4 @@
-//! A camera that is missing at the start does not keep the rig from starting, and its state is seen from the first second.
+//! Missing camera: the rig starts without it, and reports its state from the first second.
 #![cfg(target_os = "linux")]
 #![allow(clippy::unwrap_used, clippy::panic)] // a test may fail by panicking, in its helpers too
 
@@ -14,7 +14,7 @@ use std::{
 use flyrig_tests::{Running, run};
 
 const PROGRAM: &str = env!("CARGO_BIN_EXE_flyrig-under-test");
-/// Far longer than anything here takes: a hang fails instead of hanging.
+/// Timeout, far longer than any step takes: a hang fails the test.
 const PATIENCE: Duration = Duration::from_secs(90);
 
 fn free_port() -> u16 {
@@ -60,7 +60,7 @@ fn a_rig_starts_without_its_camera_and_says_so() {
         .spawn()
         .unwrap();
     let mut rig = Running(child);
-    // The watchdog is fed while the rig waits for somebody to learn the shape of.
+    // The watchdog is fed while the rig waits for a person whose shape it can measure.
     let mut states = String::new();
     while states.matches("WATCHDOG=1").count() < 2 {
         let mut bytes = [0; 1024];
@@ -83,12 +83,12 @@ fn a_rig_starts_without_its_camera_and_says_so() {
     ] {
         assert!(metrics.contains(line), "{line} in\n{metrics}");
     }
-    assert!(rig.0.try_wait().unwrap().is_none(), "the rig is still up");
+    assert!(rig.0.try_wait().unwrap().is_none(), "the rig must keep running");
     let id = rig.0.id().to_string();
     assert!(Command::new("kill").args(["-TERM", &id]).status().unwrap().success());
     let mut said = String::new();
     rig.0.stderr.take().unwrap().read_to_string(&mut said).unwrap();
-    assert!(rig.0.wait().unwrap().success(), "a rig that is asked to stop ends well: {said}");
+    assert!(rig.0.wait().unwrap().success(), "the rig must exit with 0 on SIGTERM: {said}");
 }
 
 #[test]
@@ -103,12 +103,12 @@ fn a_recording_that_breaks_off_fails_the_command_after_a_clean_end() {
     let command = |args: &[&str]| run(PROGRAM, args, folder.path()).unwrap();
     let whole = command(&["record", "rig.toml", "--out", "whole.mcap"]);
     assert_eq!(whole.code, Some(0), "{whole:?}");
-    assert!(folder.path().join("whole-0002.mcap").exists(), "40 frames of 77 kB are three files of 1 MB or more");
-    // In the way of the third file.
+    assert!(folder.path().join("whole-0002.mcap").exists(), "40 frames of 77 kB must fill three files of 1 MB");
+    // A file blocks the path of the third part.
     std::fs::write(folder.path().join("take-0002.mcap"), "").unwrap();
     let broken = command(&["run", "rig.toml", "--record", "take.mcap"]);
     assert_eq!(broken.code, Some(1), "{broken:?}");
-    assert!(broken.stderr.contains("run: 20 sets"), "the rig goes on: {}", broken.stderr);
+    assert!(broken.stderr.contains("run: 20 sets"), "the rig must go on: {}", broken.stderr);
     assert!(broken.stderr.contains("error: the recording broke off after"), "{}", broken.stderr);
     assert!(broken.stderr.contains("take-0002.mcap cannot be created"), "{}", broken.stderr);
 }

@@ -1,4 +1,4 @@
-//! Cameras of another computer: `flyrig capture` on one side, the rig on the other.
+//! Cameras of another computer: `flyrig capture` on one side, the rig on the other side.
 #![allow(clippy::unwrap_used, clippy::panic)] // a test may fail by panicking, in its helpers too
 
 use std::{
@@ -41,7 +41,7 @@ fn cameras_of_another_process_are_recorded_in_whole_sets() {
     let record =
         |config: &str, out: &str, seconds: &str| command(&["record", config, "--out", out, "--seconds", seconds]);
 
-    // The other side takes its time to start; what is recorded then is whole.
+    // The other side needs time to start; retry until a recording has frames.
     let replayed = (0..8)
         .find_map(|take| {
             let file = format!("take{take}.mcap");
@@ -50,13 +50,13 @@ fn cameras_of_another_process_are_recorded_in_whole_sets() {
             let replayed = command(&["replay", &file]);
             replayed.stdout.contains("frames of Mjpeg 64x64").then_some(replayed)
         })
-        .unwrap_or_else(|| panic!("no frame came"));
+        .unwrap_or_else(|| panic!("no frame arrived"));
     let sets = replayed.stdout.lines().find_map(|line| line.strip_prefix("sets: ")).unwrap();
     let complete: usize = sets.split(' ').next().unwrap().parse().unwrap();
     assert!(complete > 3, "{}", replayed.stdout);
 
     let lost = record("wrong.toml", "none.mcap", "2");
-    assert!(lost.stderr.contains("no computer of rig 'stagee' is there, but of 'stage'"), "{}", lost.stderr);
+    assert!(lost.stderr.contains("no computer of rig 'stagee' is present, but of 'stage'"), "{}", lost.stderr);
     let twice = command(&["capture", "rig.toml"]);
     assert_eq!(twice.code, Some(1));
     assert!(twice.stderr.contains("these cameras are on the network already"), "{}", twice.stderr);

@@ -1,4 +1,4 @@
-//! What we are compared with is not drawn by what is compared: the simulator does not depend on the renderer.
+//! Independence of the ground truth: the simulator does not depend on the renderer that it evaluates.
 #![allow(clippy::unwrap_used, clippy::panic)] // a test may fail by panicking, in its helpers too
 
 use std::path::Path;
@@ -22,6 +22,6 @@ fn the_simulator_does_not_use_the_renderer() {
             }
         }
     }
-    assert!(seen.contains(&"flyrig-body".to_owned()), "the walk works: {seen:?}");
+    assert!(seen.contains(&"flyrig-body".to_owned()), "the dependencies were not walked: {seen:?}");
     assert!(!seen.contains(&"flyrig-renderer".to_owned()), "{seen:?}");
 }

@@ -1,4 +1,4 @@
-//! A viewer who asks for too much is refused in words; the rig and the other viewers go on.
+//! Oversized viewpoint: its viewer gets an error that names the limit; the rig and the other viewers go on.
 #![allow(clippy::unwrap_used)] // a test may fail by panicking
 
 mod support;
@@ -22,19 +22,19 @@ fn a_view_that_is_too_large_is_refused_to_its_viewer_alone() {
     let _plain = watch("plain", &[]);
     wait_until("the plain viewer's images", || seen("plain") > 3);
 
-    // More pixels a second than all viewers may have together.
+    // More pixels per second than the budget of all viewers together.
     let _greedy = watch("greedy", &["--eye", "3,0,1.5", "--size", "2000x2000"]);
     wait_until("the refusal of the rate", || log("greedy").contains("the rig refuses the viewpoint"));
     assert!(log("greedy").contains("Mpx/s") && log("greedy").contains("ask for"), "{}", log("greedy"));
 
-    // Larger than Mesa's software adapter binds, which used to end the rig; larger adapters refuse the rate.
+    // Larger than Mesa's software adapter can bind; other adapters refuse the rate.
     let _large = watch("large", &["--eye", "3,0,1.5", "--size", "4096x4096"]);
     wait_until("the refusal of the size", || log("large").contains("the rig refuses the viewpoint"));
     assert!(log("large").contains("Mpx") && log("large").contains("ask for"), "{}", log("large"));
 
     let before = seen("plain");
     wait_until("the plain viewer's images after that", || seen("plain") > before + 10);
-    assert!(rig.0.try_wait().unwrap().is_none(), "the rig is still up: {}", log("run"));
+    assert!(rig.0.try_wait().unwrap().is_none(), "the rig must keep running: {}", log("run"));
     rig.signal("INT");
     wait_until("the rig to end", || rig.0.try_wait().unwrap().is_some());
     assert!(rig.0.wait().unwrap().success());

@@ -1,4 +1,4 @@
-//! People are found, measured and followed from raw images.
+//! Perception: people are found, measured and tracked in raw images.
 #![allow(clippy::unwrap_used)] // a test may fail by panicking, in its helpers too
 
 use std::{
@@ -16,15 +16,15 @@ const RIG: &str = "[source]\nkind = \"sim\"\npath = \"sim.toml\"\nreal_time = fa
     [transport]\nlisten = [\"tcp/127.0.0.1:0\"]\n";
 
 #[test]
-fn a_rig_measures_whoever_comes_and_then_follows_the_person() {
+fn a_rig_measures_a_new_person_and_then_tracks_them() {
     let folder = tempfile::tempdir().unwrap();
     std::fs::write(folder.path().join("sim.toml"), SIM).unwrap();
-    // A place is left free: nobody is in it.
+    // One place for a person stays free.
     std::fs::write(folder.path().join("rig.toml"), format!("{RIG}[perception]\npeople = 2\n")).unwrap();
     let ran = run(PROGRAM, &["run", "rig.toml"], folder.path()).unwrap();
     assert_eq!(ran.code, Some(0), "{}", ran.stderr);
     assert!(ran.stderr.contains("person 0 is 1."), "{}", ran.stderr);
-    assert!(!ran.stderr.contains("person 1 is"), "there is one person: {}", ran.stderr);
+    assert!(!ran.stderr.contains("person 1 is"), "only one person is in view: {}", ran.stderr);
     assert!(ran.stderr.contains("run: 22 sets"), "{}", ran.stderr);
 
     std::fs::write(folder.path().join("rig.toml"), format!("{RIG}[perception]\npeople = 5\n")).unwrap();
@@ -34,7 +34,7 @@ fn a_rig_measures_whoever_comes_and_then_follows_the_person() {
 }
 
 #[test]
-fn a_signal_has_everybody_measured_again() {
+fn a_signal_starts_a_new_measurement() {
     let folder = tempfile::tempdir().unwrap();
     std::fs::write(folder.path().join("rig.toml"), RIG).unwrap();
     std::fs::write(folder.path().join("sim.toml"), SIM.replace("frames = 22", "frames = 70")).unwrap();
@@ -46,7 +46,7 @@ fn a_signal_has_everybody_measured_again() {
         .unwrap();
     let id = rig.id().to_string();
     let mut said = Vec::new();
-    // Until the rig ends, after its last frame.
+    // Signal until the rig ends after its last frame.
     for line in BufReader::new(rig.stderr.take().unwrap()).lines() {
         let line = line.unwrap();
         if line.contains("person 0 is 1.") {
@@ -85,12 +85,12 @@ fn one_camera_measures_people_by_the_floor_or_takes_a_known_or_average_height() 
         let events = trace["traceEvents"].as_array().unwrap().iter();
         events.filter(|event| event["name"] == stage && event["dur"].as_f64() > Some(0.0)).count()
     };
-    // Three sets; the report draws views of its own.
+    // Three frame sets; the report renders additional views.
     for stage in ["pose from images", "network", "deformation"] {
         assert_eq!(times(stage), 3, "{stage}");
     }
     assert!(times("render a view") >= 3);
-    // A floor above the camera.
+    // The floor is above the camera.
     let average = eval(&["--floor", "5"]);
     assert_eq!(average.code, Some(0), "{}", average.stderr);
     assert!(average.stderr.contains("an average height"), "{}", average.stderr);
@@ -122,7 +122,7 @@ fn hands_and_face_are_found_in_images_alone() {
         let line = ran.stdout.lines().find_map(|line| line.trim().strip_prefix(what));
         line.and_then(|rest| rest.trim().parse().ok()).unwrap_or(0)
     };
-    // Four sets of two hands and a head.
+    // Four frame sets of two hands and a head.
     assert!(counted("hands fitted") >= 4, "{}", ran.stdout);
     assert_eq!(counted("hands fitted") + counted("hands relaxed"), 8, "{}", ran.stdout);
     assert!(counted("heads turned by the face") >= 2, "{}", ran.stdout);
@@ -159,7 +159,7 @@ fn shoes_and_a_skirt_are_found_and_drawn_and_trousers_are_no_skirt() {
         assert_eq!(estimated.contains("tall, in a skirt or long coat"), worn, "{estimated}");
         let (given, iou) = eval(seed, "given");
         assert_eq!(given.contains("person 0 wears a skirt or long coat"), worn, "{given}");
-        // Everybody here wears shoes.
+        // Every person in this test wears shoes.
         assert!(estimated.contains("shoes") && given.contains("shoes"), "{estimated}\n{given}");
         assert!(iou > 0.85, "seed {seed}: {iou}");
     }

@@ -1,4 +1,4 @@
-//! `flyrig run` resumes the person that it saved.
+//! Saved person: `flyrig run` resumes the person that it saved.
 #![allow(clippy::unwrap_used)] // a test may fail by panicking
 
 mod support;

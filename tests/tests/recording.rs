@@ -1,4 +1,4 @@
-//! What a rig saw can be recorded, replayed to the bit, and exported.
+//! Recordings: recorded frames are replayed bit for bit and exported.
 #![allow(clippy::unwrap_used, clippy::panic)] // a test may fail by panicking, in its helpers too
 
 use flyrig_tests::run;
@@ -20,7 +20,7 @@ fn a_recording_is_replayed_to_the_bit_and_exported() {
     assert_eq!(recorded.code, Some(0), "{recorded:?}");
     assert!(recorded.stdout.starts_with("record: 12 frames"), "{}", recorded.stdout);
     let again = command(&["record", "rig.toml", "--out", "take.mcap"]);
-    assert_eq!(again.code, Some(1), "a recording is not written over");
+    assert_eq!(again.code, Some(1), "a recording must not be overwritten");
     assert!(again.stderr.contains("take.mcap cannot be recorded to"), "{}", again.stderr);
 
     let replayed = command(&["replay", "take.mcap", "--export", "take"]);
@@ -33,7 +33,7 @@ fn a_recording_is_replayed_to_the_bit_and_exported() {
     let digest = |text: &str| text.lines().find(|line| line.starts_with("digest")).unwrap().to_owned();
     assert_eq!(digest(&command(&["replay", "take.mcap"]).stdout), digest(&replayed.stdout));
 
-    // A killed recorder leaves a file without an end.
+    // A killed recorder leaves a truncated file.
     let bytes = std::fs::read(folder.path().join("take.mcap")).unwrap();
     std::fs::write(folder.path().join("cut.mcap"), &bytes[..bytes.len() * 9 / 10]).unwrap();
     let cut = command(&["replay", "cut.mcap"]);
@@ -46,7 +46,7 @@ fn a_recording_is_replayed_to_the_bit_and_exported() {
 }
 
 #[test]
-fn images_are_recorded_as_jpeg_unless_told_otherwise_and_poses_beside_them() {
+fn images_are_recorded_as_jpeg_by_default_with_poses() {
     let folder = tempfile::tempdir().unwrap();
     std::fs::write(folder.path().join("sim.toml"), SIM).unwrap();
     let rig = RIG.replace("jpeg_quality = 0", "jpeg_quality = 95");

@@ -1,4 +1,4 @@
-//! The person stream, end to end: a rig's person is recorded, played again, and drawn by a viewer as the rig draws it.
+//! Person stream, end to end: a rig's person is recorded, played again, and drawn by a viewer as the rig draws it.
 #![allow(clippy::unwrap_used, clippy::panic)] // a test may fail by panicking, in its helpers too
 
 mod support;
@@ -17,7 +17,7 @@ fn config(rig: &str, endpoint: &str) -> TransportConfig {
     TransportConfig { connect: vec![endpoint.to_owned()], ..TransportConfig::subscriber(rig) }
 }
 
-/// The people of a rig as a viewer has them once all colours have come, drawn through a camera.
+/// Draws the received people through a camera, once the viewer has all colours.
 fn view(receiver: &Receiver, gpu: &GpuContext, camera: &flyrig_types::Camera) -> (u64, flyrig_types::RenderedView) {
     wait_until("a person with all colours", || {
         let state = receiver.state();
@@ -39,12 +39,12 @@ fn view(receiver: &Receiver, gpu: &GpuContext, camera: &flyrig_types::Camera) ->
 #[test]
 fn a_viewer_draws_the_person_as_the_rig_does_live_and_from_a_recording() {
     let folder = tempfile::tempdir().unwrap();
-    // Standing still, so that frames of different times look alike.
+    // The person stands still, so that frames of different times look alike.
     let endpoint = small_rig("stream", folder.path(), "");
     std::fs::write(folder.path().join("sim.toml"), format!("{SMALL_SIM}motion.kind = \"still\"\n")).unwrap();
     let gpu = GpuContext::new(&AdapterChoice::Best).unwrap();
 
-    // The viewer comes first.
+    // The viewer starts first.
     let receiver = Receiver::start(&config("stream", &endpoint), || {}).unwrap();
     assert!(receiver.state().trouble("stream", &endpoint).unwrap().contains("No rig 'stream'"));
     let mut record = Process::start(
@@ -56,7 +56,7 @@ fn a_viewer_draws_the_person_as_the_rig_does_live_and_from_a_recording() {
     let mut rig = Process::start(PROGRAM, &["run", "rig.toml"], folder.path(), "run");
     wait_until("the rig's cameras", || receiver.state().rig.is_some());
     let mut camera = receiver.state().rig.clone().unwrap().cameras[0].clone();
-    // The rig draws through the same lens when it is asked to.
+    // Request the rig's own view through the same lens.
     camera.intrinsics.lens = flyrig_types::Lens::PINHOLE;
     let (frame, ours) = view(&receiver, &gpu, &camera);
     assert!(receiver.state().trouble("stream", &endpoint).is_none());
@@ -75,11 +75,11 @@ fn a_viewer_draws_the_person_as_the_rig_does_live_and_from_a_recording() {
     let jpeg = image::load_from_memory(&theirs.bytes).unwrap().into_rgb8();
     let ours_on_grey = flyrig_renderer::composite_over(&ours.rgba, &vec![30; ours.rgba.len() / 4 * 3]);
     let psnr = psnr(&ours_on_grey, &jpeg);
-    // JPEG and a person who breathes stay between the two.
+    // JPEG compression and the person's breathing remain as differences.
     assert!(psnr > 28.0, "{psnr}");
     let shown = ours.rgba.chunks_exact(4).filter(|pixel| pixel[3] > 127).count();
     assert!(shown > 300, "{shown} pixels");
-    // A recording that begins amid the stream is complete after the refresh of every segment.
+    // A recording that begins in the middle of the stream is complete once every segment was refreshed.
     let captured = || receiver.state().people.get(0)?.motion_at(clock_secs(), false).map(|m| m.stamp.capture_nanos);
     let start = captured().unwrap();
     wait_until("a recording longer than a refresh", || captured().is_some_and(|now| now > start + 4_000_000_000));
@@ -89,7 +89,7 @@ fn a_viewer_draws_the_person_as_the_rig_does_live_and_from_a_recording() {
     assert!(record.0.wait().unwrap().success());
     drop(receiver);
 
-    // Another rig of the same person, out of the file.
+    // Another rig plays the same person from the file.
     let port = std::net::TcpListener::bind("127.0.0.1:0").unwrap().local_addr().unwrap().port();
     let endpoint = format!("tcp/127.0.0.1:{port}");
     let play = ["play", "take.mcap", "--rig", "again", "--listen", &endpoint, "--repeat", "--wait"];
@@ -102,7 +102,7 @@ fn a_viewer_draws_the_person_as_the_rig_does_live_and_from_a_recording() {
     assert!(psnr > 28.0, "{psnr}");
     let state = receiver.state();
     assert_eq!(state.rig.as_ref().unwrap().cameras.len(), 2);
-    assert!(state.age.unwrap().1, "the age of what is played is known exactly");
+    assert!(state.age.unwrap().1, "the age of a played stream must be exact");
     assert!(state.problem.is_none(), "{:?}", state.problem);
 }
 

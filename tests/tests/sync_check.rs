@@ -1,4 +1,4 @@
-//! A camera's lag is found, and taken off where it is told.
+//! Time offsets: `flyrig sync-check` finds the offset of a camera, and every command subtracts a given one.
 #![allow(clippy::unwrap_used, clippy::panic)] // a test may fail by panicking, in its helpers too
 
 use flyrig_tests::run;
@@ -11,7 +11,7 @@ const SIM: &str =
     "width = 112\nheight = 112\ntexture_px = 64\nframes = 75\ncameras.count = 3\nmotion.kind = \"jump\"\n";
 const FAULT: &str = "[[faults.fault]]\nkind = \"offset\"\ncamera = \"02\"\nms = 45.0\n";
 
-/// Lags in milliseconds by camera as a report tells them.
+/// Returns the time offsets of a report in milliseconds, by camera.
 fn lags(report: &str) -> Vec<(String, f64)> {
     let line = |line: &str| {
         let mut words = line.split_whitespace();
@@ -22,7 +22,7 @@ fn lags(report: &str) -> Vec<(String, f64)> {
 }
 
 #[test]
-fn a_lag_is_found_and_taken_off() {
+fn a_time_offset_is_found_and_subtracted() {
     let folder = tempfile::tempdir().unwrap();
     std::fs::write(folder.path().join("sim.toml"), format!("{SIM}{FAULT}")).unwrap();
     let command = |args: &[&str]| run(PROGRAM, args, folder.path()).unwrap();
@@ -34,7 +34,7 @@ fn a_lag_is_found_and_taken_off() {
         let found = lags(&checked.stdout);
         assert_eq!(found.len(), 3, "{}", checked.stdout);
         for ((camera, lag), truth) in found.iter().zip(truth) {
-            assert!((lag - truth).abs() <= 2.0, "{camera}: {lag} ms in place of {truth}\n{}", checked.stdout);
+            assert!((lag - truth).abs() <= 2.0, "{camera}: {lag} ms instead of {truth}\n{}", checked.stdout);
         }
     };
     check("", [0.0, 0.0, 45.0]);

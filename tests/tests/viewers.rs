@@ -1,4 +1,4 @@
-//! Viewers come early, twice, stop, and are killed; the rig goes on.
+//! Viewers: they may start before the rig, run twice, be stopped or killed; the rig goes on.
 #![allow(clippy::unwrap_used, clippy::panic)] // a test may fail by panicking, in its helpers too
 
 mod support;
@@ -18,13 +18,13 @@ fn the_rig_outlives_every_kind_of_viewer() {
     };
     let seen = |out: &str| pictures(&folder.path().join(out));
 
-    // Before the publisher.
+    // One viewer starts before the publisher.
     let early = watch("early");
     std::thread::sleep(Duration::from_millis(500));
     let mut rig = Process::start(PROGRAM, &["run", "rig.toml"], folder.path(), "run");
     wait_until("the early viewer's images", || seen("early") > 3);
 
-    // Twice at the same time, one of them through a viewpoint of its own.
+    // Two viewers at the same time, one with its own viewpoint.
     let second = Process::start(
         PROGRAM,
         &[
@@ -48,22 +48,22 @@ fn the_rig_outlives_every_kind_of_viewer() {
     let size = image::image_dimensions(own).unwrap();
     assert_eq!(size, (64, 48));
 
-    // Stopped: the other one and the rig go on.
+    // A stopped viewer delays neither the other one nor the rig.
     early.signal("STOP");
     let (before, while_stopped) = (seen("second"), seen("early"));
     wait_until("images while one viewer is stopped", || seen("second") > before + 20);
-    assert!(seen("early") <= while_stopped + 1, "it really was stopped");
+    assert!(seen("early") <= while_stopped + 1, "the viewer was not stopped");
     early.signal("CONT");
     wait_until("the stopped viewer to catch up", || seen("early") > while_stopped + 5);
 
-    // Killed.
+    // A killed viewer does not end the rig.
     early.signal("KILL");
     let before = seen("second");
     wait_until("images after one viewer was killed", || seen("second") > before + 20);
     drop(second);
-    assert!(rig.0.try_wait().unwrap().is_none(), "the rig is still up");
+    assert!(rig.0.try_wait().unwrap().is_none(), "the rig must keep running");
 
-    // Asked to stop, the rig ends well.
+    // The rig exits with 0 on request.
     rig.signal("INT");
     wait_until("the rig to end", || rig.0.try_wait().unwrap().is_some());
     assert!(rig.0.wait().unwrap().success());

@@ -1,4 +1,4 @@
-//! The `flyrig` command, built by this package so that its tests can start it.
+//! `flyrig` command, built by this package so that its tests can run it.
 
 use std::process::ExitCode;
 

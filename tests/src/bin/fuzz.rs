@@ -1,9 +1,9 @@
-//! Everything that reads what others wrote, fed with damaged input: `make fuzz MINUTES=10`.
+//! Fuzzing of every decoder of foreign data: `make fuzz MINUTES=10`.
 //!
-//! A generator of its own, on stable Rust: seeds from `tests/corpus` are cut, spliced, flipped and filled with numbers that
-//! hurt. An input whose outcome reads differently from all before it is kept and mutated further; that finds the branches
-//! that speak, without instrumentation. A panic, an input that takes seconds, or memory that runs away ends the program
-//! with the input in a file.
+//! The generator needs only stable Rust. It truncates, splices and flips the seeds in `tests/corpus`, and inserts boundary
+//! values. An input whose outcome has a new text is kept and mutated further, which reaches every branch with a message of
+//! its own without instrumentation. A panic, an input that takes seconds, or excessive memory ends the program; the input is
+//! saved to a file.
 
 mod fuzz {
     pub mod mutate;
@@ -27,16 +27,17 @@ use fuzz::{
     targets::{TARGETS, Target},
 };
 
-/// Longest that one input may take: a machine that is busy included.
+/// Time limit of one input, with a margin for a busy machine.
 const SLOW: Duration = Duration::from_secs(10);
-/// The input in work, for whoever finds that it does not end.
+/// Input being processed (target, start, bytes), for the watch thread.
 static CURRENT: Mutex<Option<(&str, Instant, Vec<u8>)>> = Mutex::new(None);
-/// Memory that no input may take, MiB.
+/// Limit of the peak memory, MiB.
 const MOST_MIB: f64 = 3000.0;
-/// Inputs that are kept beside the seeds, and their longest.
+/// Maximum number of distinct outcomes that are tracked.
 const MOST_KEPT: usize = 2000;
+/// Maximum length of a mutated input, bytes.
 const LONGEST: usize = 1 << 16;
-/// Memory is looked at once in so many inputs.
+/// Number of inputs between two memory checks.
 const LOOK: u64 = 64;
 
 fn main() -> ExitCode {
@@ -49,10 +50,10 @@ fn main() -> ExitCode {
     let wanted: Vec<&String> =
         args.iter().filter(|arg| TARGETS.iter().any(|target| target.name == arg.as_str())).collect();
     let corpus = Path::new(env!("CARGO_MANIFEST_DIR")).join("corpus");
-    // Panics are caught and told once.
+    // Panics are caught and reported once, in the result of the target.
     std::panic::set_hook(Box::new(|_| {}));
     if let Err(error) = std::thread::Builder::new().name("watch".to_owned()).spawn(watch) {
-        println!("fuzz: nobody watches for inputs that do not end: {error}");
+        println!("fuzz: hangs are not detected: {error}");
     }
     let mut clean = true;
     for target in TARGETS.iter().filter(|target| wanted.is_empty() || wanted.iter().any(|name| *name == target.name)) {
@@ -75,7 +76,7 @@ fn run(target: &Target, corpus: &Path, time: Duration, seed: u64) -> Result<Stri
     let mut slowest = Duration::ZERO;
     let started = Instant::now();
     while started.elapsed() < time {
-        // The seeds themselves come first.
+        // Unchanged seeds come first.
         let input = match inputs.get(tried as usize) {
             Some(seed) if (tried as usize) < seeds => seed.clone(),
             _ => random.child(&inputs, LONGEST),
@@ -99,7 +100,7 @@ fn run(target: &Target, corpus: &Path, time: Duration, seed: u64) -> Result<Stri
         }
         taken += u64::from(outcome.is_ok());
         let text = outcome.unwrap_or_else(|text| text);
-        // Numbers and quoted pieces differ for ever.
+        // Letters alone: numbers in a message would make every outcome distinct.
         let shape: String = text.chars().filter(|c| c.is_alphabetic() || *c == ' ').take(200).collect();
         if outcomes.len() < MOST_KEPT && outcomes.insert(shape) && tried as usize > seeds {
             inputs.push(input);
@@ -115,7 +116,7 @@ fn run(target: &Target, corpus: &Path, time: Duration, seed: u64) -> Result<Stri
     ))
 }
 
-/// Ends the program when an input does not end.
+/// Ends the program when an input hangs.
 fn watch() {
     loop {
         std::thread::sleep(Duration::from_secs(1));
@@ -123,7 +124,7 @@ fn watch() {
         if let Some((target, since, input)) = &*current
             && since.elapsed() > 3 * SLOW
         {
-            println!("fuzz {target}: FAILED: an input does not end; {}", keep(target, input));
+            println!("fuzz {target}: FAILED: an input hangs; {}", keep(target, input));
             std::process::exit(1);
         }
     }
@@ -140,16 +141,16 @@ fn seeds(corpus: &Path) -> Result<Vec<Vec<u8>>, String> {
     paths.iter().map(|path| fs::read(path).map_err(read)).collect()
 }
 
-/// Writes an input where it can be found again.
+/// Saves an input to the folder of temporary files, and returns a message with its path.
 fn keep(target: &str, input: &[u8]) -> String {
     let path = std::env::temp_dir().join(format!("fuzz-{target}-{}.bin", std::process::id()));
     match fs::write(&path, input) {
         Ok(()) => format!("the input is {}", path.display()),
-        Err(error) => format!("the input of {} bytes could not be kept: {error}", input.len()),
+        Err(error) => format!("the input of {} bytes could not be saved: {error}", input.len()),
     }
 }
 
-/// Most memory that this process has ever had, where the system tells it.
+/// Returns the peak resident memory of this process, MiB; 0 where the system does not report it.
 fn peak_mib() -> f64 {
     let status = fs::read_to_string("/proc/self/status").unwrap_or_default();
     let line = status.lines().find_map(|line| line.strip_prefix("VmHWM:"));

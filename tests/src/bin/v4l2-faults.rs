@@ -1,5 +1,5 @@
-//! What real drivers do to a rig, and what the rig makes of it: run by `make test-v4l2` inside a virtual machine whose
-//! kernel has its test drivers loaded (`scripts/test-v4l2.sh`). Prints a table; fails when a bound is broken.
+//! Fault injection through real camera drivers. `make test-v4l2` runs it inside a virtual machine whose kernel has its test
+//! drivers loaded (`scripts/test-v4l2.sh`). Prints a table of faults; fails when a bound is exceeded.
 
 #[cfg(target_os = "linux")]
 #[path = "v4l2_faults/mod.rs"]

@@ -1,4 +1,4 @@
-//! Rigs and viewers as processes.
+//! Processes of rigs and viewers.
 #![allow(dead_code, clippy::unwrap_used, clippy::panic)] // each test uses a part; a test may fail by panicking
 
 use std::{
@@ -7,10 +7,10 @@ use std::{
     time::{Duration, Instant},
 };
 
-/// Far longer than anything here takes: a hang fails instead of hanging.
+/// Timeout, far longer than any step takes: a hang fails the test.
 pub const PATIENCE: Duration = Duration::from_secs(90);
 
-/// A process that does not outlive its test.
+/// Process that is killed when its test ends.
 pub struct Process(pub Child);
 
 impl Process {
@@ -26,7 +26,7 @@ impl Process {
         Self(child)
     }
 
-    /// Sends a signal by its name, without SIG.
+    /// Sends a signal, named without SIG.
     pub fn signal(&self, name: &str) {
         let status = Command::new("kill").args([&format!("-{name}"), &self.0.id().to_string()]).status().unwrap();
         assert!(status.success());
@@ -40,25 +40,25 @@ impl Drop for Process {
     }
 }
 
-/// Number of PNG files in a folder.
+/// Counts the PNG files in a folder.
 pub fn pictures(folder: &Path) -> usize {
     std::fs::read_dir(folder)
         .map_or(0, |entries| entries.flatten().filter(|e| e.path().extension().is_some_and(|e| e == "png")).count())
 }
 
-/// Waits until something is done; panics when it takes too long.
+/// Waits until the condition holds; panics at the timeout.
 pub fn wait_until(what: &str, mut done: impl FnMut() -> bool) {
     let deadline = Instant::now() + PATIENCE;
     while !done() {
-        assert!(Instant::now() < deadline, "waited in vain for {what}");
+        assert!(Instant::now() < deadline, "timed out waiting for {what}");
         std::thread::sleep(Duration::from_millis(50));
     }
 }
 
-/// Simulated cameras of [`small_rig`].
+/// Number of simulated cameras of [`small_rig`].
 pub const SMALL_SIM: &str = "width = 96\nheight = 96\ntexture_px = 128\n";
 
-/// Writes `rig.toml` and `sim.toml` of a small simulated rig with this name, and returns the endpoint that it listens on. `more` is
+/// Writes `rig.toml` and `sim.toml` of a small simulated rig with this name; returns the endpoint that it listens on. `more` is
 /// appended to `rig.toml`.
 pub fn small_rig(name: &str, folder: &Path, more: &str) -> String {
     let port = std::net::TcpListener::bind("127.0.0.1:0").unwrap().local_addr().unwrap().port();

@@ -1,8 +1,8 @@
-//! Damage to inputs.
+//! Mutation of inputs.
 
 use flyrig_model::SplitMix64;
 
-/// Numbers that hurt, as text and as bytes.
+/// Boundary values, inserted as bytes.
 const NUMBERS: [i64; 16] = [
     0,
     1,
@@ -21,14 +21,14 @@ const NUMBERS: [i64; 16] = [
     i64::MAX,
     i64::MIN,
 ];
-/// Their like in text.
+/// Boundary values, inserted as text.
 const WORDS: [&str; 10] =
     ["nan", "-inf", "1e308", "1e-320", "-0.0", "\"", "\\", "\u{feff}", "99999999999999999999", "\0"];
 
-/// Makes children of inputs; the same seed makes the same ones.
+/// Mutator of inputs; the same seed gives the same mutations.
 pub struct Mutator {
     random: SplitMix64,
-    /// Words of the target's language.
+    /// Keywords of the target's format.
     words: &'static [&'static str],
 }
 
@@ -41,14 +41,14 @@ impl Mutator {
         self.random.index(end)
     }
 
-    /// A stretch of at most so many bytes.
+    /// Returns a random range of at most `most` bytes.
     fn stretch(&mut self, length: usize, most: usize) -> std::ops::Range<usize> {
         let from = self.below(length);
         let upto = (from + 1 + self.below(most)).min(length);
         from..upto.max(from)
     }
 
-    /// One of the inputs, changed once to eight times.
+    /// Returns one of the inputs with one to eight mutations.
     pub fn child(&mut self, inputs: &[Vec<u8>], longest: usize) -> Vec<u8> {
         let mut child = inputs.get(self.below(inputs.len())).cloned().unwrap_or_default();
         let most = 1 << self.below(4);
@@ -74,14 +74,14 @@ impl Mutator {
                 let piece = bytes[range].to_vec();
                 bytes.splice(at..at, piece);
             }
-            // A piece of another input.
+            // Splice a range of another input.
             5 => {
                 let other = &inputs[self.below(inputs.len())];
                 let range = self.stretch(other.len(), 256);
                 let piece = other[range].to_vec();
                 bytes.splice(at..at, piece);
             }
-            // A number over what was there, in some width and order.
+            // Overwrite bytes with a boundary value, in a random width and byte order.
             6 => {
                 let number = NUMBERS[self.below(NUMBERS.len())];
                 let width = 1 << self.below(4);
@@ -93,7 +93,7 @@ impl Mutator {
                 let upto = (at + width).min(bytes.len());
                 bytes[at..upto].copy_from_slice(&number[..upto - at]);
             }
-            // A number in text for another one.
+            // Replace a number in the text.
             7 => self.number_text(bytes, at),
             8 if !self.words.is_empty() => {
                 let word = self.words[self.below(self.words.len())];
@@ -103,7 +103,7 @@ impl Mutator {
                 let word = WORDS[self.below(WORDS.len())];
                 bytes.splice(at..at, word.bytes());
             }
-            // A line twice, or gone.
+            // Duplicate or delete a line.
             _ => {
                 let start = bytes[..at].iter().rposition(|b| *b == b'\n').map_or(0, |i| i + 1);
                 let end = bytes[at..].iter().position(|b| *b == b'\n').map_or(bytes.len(), |i| at + i + 1);

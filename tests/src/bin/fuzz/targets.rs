@@ -1,5 +1,5 @@
-//! What is fed, each with the words of its language. A target says what became of the input, for people and for the choice
-//! of what to keep.
+//! Fuzz targets with the keywords of their formats. A target describes the outcome of an input; the fuzzer keeps inputs with
+//! new descriptions.
 
 use std::{cell::RefCell, fs, path::Path, time::Duration};
 
@@ -14,7 +14,7 @@ use flyrig_transport::{
 };
 use flyrig_types::{Image, PixelFormat};
 
-/// A reader of foreign bytes.
+/// Decoder under test.
 pub struct Target {
     pub name: &'static str,
     pub words: &'static [&'static str],
@@ -85,7 +85,8 @@ const PLY_WORDS: &[&str] = &[
     "end_header\n",
 ];
 
-fn told<T, E: std::fmt::Display>(result: Result<T, E>, ok: &str) -> Result<String, String> {
+/// Describes the result of a decoder: `ok`, or the text of the error.
+fn outcome_of<T, E: std::fmt::Display>(result: Result<T, E>, ok: &str) -> Result<String, String> {
     result.map(|_| ok.to_owned()).map_err(|error| error.to_string())
 }
 
@@ -104,7 +105,7 @@ const FORMATS: [PixelFormat; 12] = [
     PixelFormat::Mjpeg,
 ];
 
-/// Format, width and height of a byte each, then pixels; as many as needed or as there are.
+/// Converts pixels to RGB. The first bytes give format, width, height, and whether the pixels are padded to that size.
 fn pixels(input: &[u8]) -> Result<String, String> {
     let [format, width, height, exact, bytes @ ..] = input else { return Err("short".into()) };
     let format = FORMATS[usize::from(*format) % FORMATS.len()];
@@ -115,14 +116,14 @@ fn pixels(input: &[u8]) -> Result<String, String> {
     }
     let image = Image::new(width, height, format, bytes).map_err(|error| error.to_string())?;
     let rgb = to_rgb8(&image).map_err(|error| format!("{format:?} {error}"))?;
-    assert_eq!(rgb.len(), width as usize * height as usize * 3, "pixels went missing");
+    assert_eq!(rgb.len(), width as usize * height as usize * 3, "wrong number of RGB bytes");
     Ok(format!("{format:?}"))
 }
 
 fn jpeg(input: &[u8]) -> Result<String, String> {
     let image = Image::new(48, 32, PixelFormat::Mjpeg, input.to_vec()).map_err(|error| error.to_string())?;
     let rgb = to_rgb8(&image).map_err(|error| error.to_string())?;
-    assert_eq!(rgb.len(), 48 * 32 * 3, "pixels went missing");
+    assert_eq!(rgb.len(), 48 * 32 * 3, "wrong number of RGB bytes");
     Ok("an image".into())
 }
 
@@ -130,12 +131,12 @@ thread_local! {
     static FOLDER: RefCell<Option<tempfile::TempDir>> = const { RefCell::new(None) };
 }
 
-/// Writes files into a folder that is used again, and reads them by its path.
+/// Writes files into a folder that all inputs share, and calls `read` with its path.
 fn with_files<T>(files: &[(&str, &[u8])], read: impl FnOnce(&Path) -> T) -> Result<T, String> {
     FOLDER.with(|folder| {
         let mut folder = folder.borrow_mut();
         if folder.is_none() {
-            // Memory rather than a disk, where there is one.
+            // A file system in memory where there is one.
             let memory = Path::new("/dev/shm");
             let made = if memory.is_dir() { tempfile::tempdir_in(memory) } else { tempfile::tempdir() };
             *folder = Some(made.map_err(|error| error.to_string())?);
@@ -162,7 +163,7 @@ fn picture(input: &[u8]) -> Result<String, String> {
         let sources = FolderReplay::open(root, Some(&[camera.into()]), &FolderOptions::default());
         let mut sources = sources.map_err(|error| error.to_string())?;
         let source = sources.first_mut().ok_or("no source")?;
-        told(source.next_frame(Duration::ZERO), "a frame")
+        outcome_of(source.next_frame(Duration::ZERO), "a frame")
     })?
 }
 
@@ -176,7 +177,7 @@ fn mcap(input: &[u8]) -> Result<String, String> {
         let mut frames = 0;
         for camera in ["a", "b"] {
             let mut replay = McapReplay::open(&camera.into(), &path).map_err(|error| error.to_string())?;
-            // A recording of a few kilobytes has no more.
+            // More frames than a recording of a few kilobytes can hold.
             for _ in 0..10_000 {
                 match replay.next_frame(Duration::ZERO) {
                     Ok(frame) => {
@@ -192,37 +193,37 @@ fn mcap(input: &[u8]) -> Result<String, String> {
     })?
 }
 
-/// Both files, the second after a NUL.
+/// Loads a calibration from both YAML files, separated by a NUL byte.
 fn calibration(input: &[u8]) -> Result<String, String> {
     let cut = input.iter().position(|b| *b == 0).unwrap_or(input.len());
     let (intri, extri) = (&input[..cut], input.get(cut + 1..).unwrap_or_default());
     with_files(&[("intri.yml", intri), ("extri.yml", extri)], |root| {
         let rig = load_easymocap(root, &|_| Some((640, 480)))
             .map_err(|error| error.to_string().replace(&root.display().to_string(), ""))?;
-        assert!(rig.validate().is_ok(), "a rig came in that is none");
+        assert!(rig.validate().is_ok(), "an invalid rig was accepted");
         Ok("a rig".to_owned())
     })?
 }
 
 fn config(input: &[u8]) -> Result<String, String> {
     let text = String::from_utf8_lossy(input);
-    let rig = told(flyrig::check_config(&text), "a configuration");
+    let rig = outcome_of(flyrig::check_config(&text), "a configuration");
     rig.or_else(|error| flyrig::check_simulator(&text).map(|()| "a simulated rig".to_owned()).map_err(|_| error))
 }
 
-/// The first byte chooses the message.
+/// Decodes the message whose type the first byte selects.
 fn wire(input: &[u8]) -> Result<String, String> {
     let (choice, bytes) = input.split_first().ok_or("short")?;
     match choice % 6 {
-        0 => told(Header::decode("x", bytes), "header"),
-        1 => told(CameraStatus::decode(bytes), "status"),
-        2 => told(RigStats::decode(bytes), "stats"),
-        3 => told(decode_calibration(bytes), "calibration"),
-        4 => told(decode_transforms(bytes), "transforms"),
+        0 => outcome_of(Header::decode("x", bytes), "header"),
+        1 => outcome_of(CameraStatus::decode(bytes), "status"),
+        2 => outcome_of(RigStats::decode(bytes), "stats"),
+        3 => outcome_of(decode_calibration(bytes), "calibration"),
+        4 => outcome_of(decode_transforms(bytes), "transforms"),
         _ => {
             let (head, payload) = bytes.split_at(bytes.len().min(HEADER_BYTES));
             let header = Header::decode("x", head).map_err(|error| error.to_string())?;
-            told(ViewFrame::decode("x", &header, payload.to_vec().into()), "view")
+            outcome_of(ViewFrame::decode("x", &header, payload.to_vec().into()), "view")
         }
     }
 }
@@ -231,16 +232,16 @@ fn network_frame(input: &[u8]) -> Result<String, String> {
     let (head, payload) = input.split_at(input.len().min(FRAME_HEADER_BYTES));
     let header = FrameHeader::decode("x", head).map_err(|error| error.to_string())?;
     let frame = header.frame("x", &"a".into(), payload.to_vec()).map_err(|error| error.to_string())?;
-    // A JPEG of a few bytes may claim any size; the rig knows its cameras' sizes before it decodes.
+    // A JPEG of a few bytes may declare any size; the rig checks the declared size before it decodes.
     if frame.image.width() > 4096 || frame.image.height() > 4096 {
         return Err("large".into());
     }
-    told(to_rgb8(&frame.image), &format!("{:?}", frame.image.format()))
+    outcome_of(to_rgb8(&frame.image), &format!("{:?}", frame.image.format()))
 }
 
 fn ply(bytes: &[u8]) -> Result<String, String> {
     let splats = parse_anisotropic_ply(bytes).map_err(|error| match error {
-        // Their texts repeat the input, and no two would be alike.
+        // These messages quote the input, so each would be a new outcome.
         PlyError::Header(_) => "a header of something else".to_owned(),
         PlyError::Short { .. } => "cut off".to_owned(),
         other => other.to_string(),
@@ -250,11 +251,11 @@ fn ply(bytes: &[u8]) -> Result<String, String> {
 
 fn splats(input: &[u8]) -> Result<String, String> {
     let state = SplatState::decode(input).map_err(|error| error.to_string())?;
-    assert!(state.center_scale.iter().flatten().all(|value| value.is_finite()), "a number that is none came through");
+    assert!(state.center_scale.iter().flatten().all(|value| value.is_finite()), "a non-finite number was accepted");
     Ok("splats".into())
 }
 
-/// A message as a browser gets it, its kind first, for a person who is there already.
+/// Decodes a message of the person stream as a browser does, for a known person. The first byte selects its kind.
 fn stream(input: &[u8]) -> Result<String, String> {
     const TEMPLATE: &[u8] = include_bytes!("../../../corpus/stream/template");
     const RIG: &[u8] = include_bytes!("../../../corpus/stream/rig");
@@ -271,11 +272,11 @@ fn stream(input: &[u8]) -> Result<String, String> {
     taken.map(|()| format!("{kind:?} {}", if shown > 0 { "shown" } else { "hidden" }))
 }
 
-/// BVH text, or a binary glTF file.
+/// Parses BVH text or a binary glTF file.
 fn motion(input: &[u8]) -> Result<String, String> {
     if input.starts_with(b"glTF") {
-        return with_files(&[("body.glb", input)], |root| told(load_gltf(&root.join("body.glb")), "a body"))?;
+        return with_files(&[("body.glb", input)], |root| outcome_of(load_gltf(&root.join("body.glb")), "a body"))?;
     }
     let text = String::from_utf8_lossy(input);
-    told(parse_bvh(&text, Path::new("x.bvh")), "a clip")
+    outcome_of(parse_bvh(&text, Path::new("x.bvh")), "a clip")
 }

@@ -1,4 +1,4 @@
-//! A disk that is full while cameras are recorded.
+//! Disk that fills up during a recording.
 
 use std::{
     path::Path,
@@ -13,10 +13,10 @@ use super::{
     table::Table,
 };
 
-/// A file system of a few megabytes, which the machine's start script mounts.
+/// Mount point of a file system of a few megabytes; the virtual machine's start script mounts it.
 const DISK: &str = "/small";
 
-/// Records until nothing more fits.
+/// Records until the disk is full.
 pub fn full(table: &mut Table) {
     let path = Path::new(DISK).join("take.mcap");
     let mut sources: Vec<Box<dyn CameraSource>> = Vec::new();

@@ -1,4 +1,4 @@
-//! The machine: faults are injected through it, and leaks show in it.
+//! Host functions: fault injection and counters of leaks.
 
 use std::{
     fs::{self, File},
@@ -26,7 +26,7 @@ pub fn set_control(bus: &str, name: &str, value: i32) {
     }
 }
 
-/// Opens a camera in another process as another user; gives whether it could, and what it said.
+/// Opens a camera in another process as another user; returns its success and its message.
 pub fn open_as_nobody(bus: &str, user: u32) -> (bool, String) {
     let program = "/proc/self/exe";
     match Command::new(program).args(["--open", bus]).uid(user).gid(user).output() {
@@ -35,8 +35,8 @@ pub fn open_as_nobody(bus: &str, user: u32) -> (bool, String) {
     }
 }
 
-/// Takes all cameras away and brings them back; gives the names of their nodes. `hold` keeps the old ones open meanwhile,
-/// so that the new ones get other numbers.
+/// Unbinds and rebinds all cameras; returns the names of their nodes. `hold` keeps the old nodes open meanwhile, so that the
+/// new ones get other numbers.
 pub fn replug_all(hold: bool) -> Vec<String> {
     let nodes = |reports: &[flyrig_capture::CameraReport]| -> Vec<String> {
         reports.iter().map(|report| report.node.node.display().to_string()).collect()
@@ -60,17 +60,17 @@ pub fn replug_all(hold: bool) -> Vec<String> {
     after
 }
 
-/// Open file descriptors of this process.
+/// Counts the open file descriptors of this process.
 pub fn open_files() -> usize {
     fs::read_dir("/proc/self/fd").map_or(0, Iterator::count)
 }
 
-/// Threads of this process.
+/// Counts the threads of this process.
 pub fn threads() -> usize {
     fs::read_dir("/proc/self/task").map_or(0, Iterator::count)
 }
 
-/// CPU time of this process, seconds.
+/// Returns the CPU time of this process, seconds.
 pub fn cpu_secs() -> f64 {
     let stat = fs::read_to_string("/proc/self/stat").unwrap_or_default();
     let after_name = stat.rsplit(')').next().unwrap_or("");

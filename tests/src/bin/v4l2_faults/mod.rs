@@ -1,4 +1,4 @@
-//! The faults, one function each.
+//! Faults, one function each.
 
 mod disk;
 mod host;
@@ -18,12 +18,12 @@ use self::{
     table::Table,
 };
 
-/// Frames a second that are asked for.
+/// Requested frame rate, frames per second.
 const FPS: f64 = 30.0;
-/// Seconds that a fault is watched for.
+/// Duration of the observation of a fault.
 const WATCH: Duration = Duration::from_secs(4);
 
-/// Runs all of them, or those whose names hold the first argument.
+/// Runs every fault, or opens one camera with `--open BUS`.
 pub fn main() -> ExitCode {
     let arguments: Vec<String> = std::env::args().skip(1).collect();
     if let [mode, bus] = arguments.as_slice()
@@ -51,7 +51,7 @@ pub fn main() -> ExitCode {
     if table.all_within() { ExitCode::SUCCESS } else { ExitCode::FAILURE }
 }
 
-/// Opens one camera and says how that went; started by the faults below as another user.
+/// Opens one camera and prints the error; the faults below start it as another user.
 fn open_once(bus: &str) -> ExitCode {
     match V4l2Camera::open(&"other".into(), &options(bus)) {
         Ok(_) => ExitCode::SUCCESS,
@@ -75,21 +75,21 @@ fn steady(table: &mut Table) {
     let is_fast = seen.cameras.iter().all(|camera| camera.lost_share() < 0.02);
     table.row(
         "none",
-        "4 x 640x360 YUYV at 30 a second, 12 s",
+        "4 x 640x360 YUYV at 30 per second, 12 s",
         &format!("{} frames, {lost} missing in the drivers' numbers, {} errors", seen.frames(), seen.errors()),
         if is_fast {
-            "within 15 % of 30 a second; no errors"
+            "within 15 % of 30 per second; no errors"
         } else {
             "no errors; this machine is too slow for four cameras"
         },
-        &format!("{} a second", rates.join(", ")),
+        &format!("{} per second", rates.join(", ")),
         seen.errors() == 0
             && seen.cameras.iter().all(|camera| camera.frames > 10)
             && (!is_fast || seen.cameras.iter().all(|camera| (camera.rate() / FPS - 1.0).abs() < 0.15)),
     );
     table.row(
         "none",
-        "their sets, window 16.7 ms",
+        "frame sets, window 16.7 ms",
         &format!("{} complete, {} partial", seen.complete, seen.partial),
         if is_fast { "9 of 10 complete" } else { "none: this machine is too slow for four cameras" },
         &format!(
@@ -109,7 +109,7 @@ fn dropped(table: &mut Table) {
     let seen = rig.watch(Duration::from_secs(10));
     set_control(&bus(0), "percentage_of_dropped_buffers", 0);
     let hit = &seen.cameras[0];
-    // A slow machine loses some of both.
+    // A slow machine loses some of each.
     let is_fast = seen.cameras[1].lost_share() < 0.02;
     let percent = 100.0 * (1.0 - (1.0 - hit.lost_share()) / (1.0 - seen.cameras[1].lost_share()));
     table.row(
@@ -184,7 +184,7 @@ fn silent(table: &mut Table) {
         "silent camera",
         "one camera sends nothing for a while",
         &format!("noticed {noticed:.0} ms after its last frame, back {:.0} ms after it spoke again", back.ms()),
-        "500 ms, and what a busy machine takes to look (200); back within 2 s; the other unharmed",
+        "500 ms, plus the delay of a busy machine (200); back within 2 s; the other camera unaffected",
         &format!("{noticed:.0} ms"),
         noticed < 700.0 && back.ms() < 2000.0 && other.cameras[1].is_sound(),
     );
@@ -195,7 +195,7 @@ fn wraps(table: &mut Table) {
     for control in ["wrap_sequence_number", "wrap_timestamp"] {
         set_control(&bus(0), control, 1);
     }
-    // The driver starts near the end of its numbers at the next STREAMON.
+    // The driver starts near the largest sequence number at the next STREAMON.
     rig = rig.restarted();
     let seen = rig.watch(Duration::from_secs(10));
     for control in ["wrap_sequence_number", "wrap_timestamp"] {
@@ -203,14 +203,14 @@ fn wraps(table: &mut Table) {
     }
     let hit = &seen.cameras[0];
     table.row(
-        "numbers and stamps wrap",
+        "sequence numbers and timestamps wrap",
         "the driver's counters run over while streaming",
         &format!(
-            "{} frames, {} lost, {} stamps replaced, {} backwards",
+            "{} frames, {} lost, {} timestamps replaced, {} backwards",
             hit.frames, hit.lost, hit.health.stamps_replaced, hit.backwards
         ),
-        "times grow; at most 40 stamps until the driver's clock is learnt; nothing else breaks",
-        &format!("{} complete sets, {} partial", seen.complete, seen.partial),
+        "timestamps increase; at most 40 replaced until the driver's clock is learnt; no other error",
+        &format!("{} complete frame sets, {} partial", seen.complete, seen.partial),
         hit.backwards == 0 && hit.health.stamps_replaced <= 40 && hit.is_sound() && hit.health.reconnects == 0,
     );
 }
@@ -295,7 +295,7 @@ fn replugged(table: &mut Table, cycles: usize) {
     let mut failures = 0;
     let mut numbers = std::collections::BTreeSet::new();
     for cycle in 0..cycles {
-        // Every other time the old nodes stay held, so that new numbers are given.
+        // Hold the old nodes open every other time, so that the driver assigns new numbers.
         let wanted: Vec<u64> = rig.now().iter().map(|camera| camera.health.reconnects + 1).collect();
         numbers.extend(replug_all(cycle % 2 == 1));
         let back = rig.until(Duration::from_secs(10), |cameras| {

@@ -1,4 +1,4 @@
-//! A camera of the test driver through the crate nokhwa, whose reads wait for ever.
+//! Camera of the test driver through the crate nokhwa, whose reads block without a timeout.
 
 use std::time::{Duration, Instant};
 
@@ -13,11 +13,11 @@ use super::{
     table::Table,
 };
 
-/// Times that it is unplugged.
+/// Number of times the camera is unplugged.
 const CYCLES: usize = 5;
 
 fn open(table: &mut Table) -> Option<NokhwaCamera> {
-    // By its name: a node that is still open when its camera comes back has its number taken.
+    // Identify it by name: if a node is still open when its camera returns, the camera gets another number.
     let report = camera_reports().into_iter().find(|report| report.bus_info.as_deref() == Some(bus(0).as_str()))?;
     let (device, format) = (NokhwaDevice::Name(report.node.name), FormatChoice::Auto);
     let wanted = NokhwaOptions { device, width: 640, height: 360, fps: super::FPS, format, lag_secs: 0.0 };
@@ -30,7 +30,7 @@ fn open(table: &mut Table) -> Option<NokhwaCamera> {
     }
 }
 
-/// All of them.
+/// Runs every fault.
 pub fn run(table: &mut Table) {
     let (files, running) = (open_files(), threads());
     if let Some(camera) = open(table) {
@@ -39,7 +39,7 @@ pub fn run(table: &mut Table) {
     if let Some(camera) = open(table) {
         lost(table, camera);
     }
-    // A thread's last steps come after its camera is closed.
+    // A thread ends slightly after its camera is closed.
     let deadline = Instant::now() + Duration::from_secs(2);
     while threads() > running && Instant::now() < deadline {
         std::thread::sleep(Duration::from_millis(20));
@@ -74,7 +74,7 @@ fn flowing(table: &mut Table, mut camera: NokhwaCamera) {
         "one vivid camera, 640x360, 5 s",
         &format!("{}; {errors} errors", camera.health().mode),
         "frames flow without errors, less than 300 ms old",
-        &format!("{:.1} a second, stamps {age:.1} ms before the frame is here", f64::from(frames) / 5.0),
+        &format!("{:.1} per second, timestamps {age:.1} ms before the arrival of the frame", f64::from(frames) / 5.0),
         frames > 20 && errors == 0 && (0.0..300.0).contains(&age),
     );
 }
@@ -93,7 +93,7 @@ fn lost(table: &mut Table, camera: NokhwaCamera) {
         "silent camera (nokhwa)",
         "it sends nothing for 4 s, so that its read hangs",
         &format!("noticed {noticed:.0} ms after its last frame, back {:.0} ms after it spoke again", back.ms()),
-        "500 ms, and what a busy machine takes to look (200); one thread more at most; back within 10 s",
+        "500 ms, plus the delay of a busy machine (200); at most one thread more; back within 10 s",
         &format!("{noticed:.0} ms, {grown} threads more"),
         noticed < 700.0 && grown <= 1 && back.ms() < 10_000.0,
     );

@@ -1,4 +1,4 @@
-//! Cameras, their threads and the synchronizer, watched.
+//! Observed rig: cameras, their threads and the synchronizer.
 
 use std::time::{Duration, Instant};
 
@@ -11,7 +11,7 @@ use flyrig_types::SetKind;
 
 use super::{bus, host::cpu_secs};
 
-/// What a camera of the test driver is opened as.
+/// Returns the options of a camera of the test driver.
 pub fn options(bus: &str) -> CameraOptions {
     CameraOptions {
         identity: CameraIdentity::Bus(bus.to_owned()),
@@ -26,7 +26,7 @@ pub fn options(bus: &str) -> CameraOptions {
     }
 }
 
-/// A running rig of the first cameras of the test driver.
+/// Running rig of cameras.
 pub struct Rig {
     cameras: usize,
     threads: CaptureThreads,
@@ -37,23 +37,23 @@ pub struct Rig {
     first_stats: Vec<CameraStats>,
 }
 
-/// What came of one camera in a while.
+/// Observations of one camera.
 #[derive(Clone)]
 pub struct Seen {
     pub frames: u64,
     pub lost: u64,
     pub longest_gap_ms: f64,
-    /// Frames whose time was not after the one before.
+    /// Number of frames whose timestamp is not later than the previous one.
     pub backwards: u64,
     pub health: SourceHealth,
-    /// Of the last frame.
+    /// Exposure time of the last frame.
     pub exposure_nanos: Option<u64>,
     seconds: f64,
     last_frame: Option<Instant>,
     errors: Vec<(CaptureErrorKind, u64)>,
 }
 
-/// What came of all cameras in a while.
+/// Observations of all cameras over an interval.
 pub struct Watched {
     pub cameras: Vec<Seen>,
     pub complete: u64,
@@ -62,7 +62,7 @@ pub struct Watched {
     latencies_ms: Vec<f64>,
 }
 
-/// How long something took, or that it never came.
+/// Time in milliseconds until a condition held, or until the wait was given up.
 #[derive(Clone, Copy)]
 pub enum Share {
     After(f64),
@@ -92,12 +92,12 @@ impl Seen {
         }
     }
 
-    /// Frames a second that came.
+    /// Returns the frame rate, frames per second.
     pub fn rate(&self) -> f64 {
         self.frames as f64 / self.seconds.max(1e-9)
     }
 
-    /// Without errors and long gaps. A slow machine loses single frames; that is counted and no harm.
+    /// Reports whether frames arrived without errors and long gaps. Single lost frames are allowed: a slow machine loses some.
     pub fn is_sound(&self) -> bool {
         self.errors.is_empty() && self.longest_gap_ms < 500.0 && self.frames > 0
     }
@@ -106,12 +106,12 @@ impl Seen {
         self.errors.iter().filter(|(found, _)| *found == kind).map(|(_, count)| count).sum()
     }
 
-    /// Share of the driver's frames that never came.
+    /// Returns the fraction of the driver's frames that were lost.
     pub fn lost_share(&self) -> f64 {
         self.lost as f64 / (self.lost + self.frames).max(1) as f64
     }
 
-    /// Milliseconds since the last frame.
+    /// Returns the milliseconds since the last frame.
     pub fn silent_ms(&self) -> f64 {
         self.last_frame.map_or(f64::INFINITY, |at| at.elapsed().as_secs_f64() * 1e3)
     }
@@ -126,7 +126,7 @@ impl Watched {
         self.cameras.iter().flat_map(|camera| &camera.errors).map(|(_, count)| count).sum()
     }
 
-    /// Latency from capture to set at a share of all sets.
+    /// Returns the quantile `share` of the latency from capture to frame set, milliseconds.
     pub fn latency_ms(&self, share: f64) -> f64 {
         let mut sorted = self.latencies_ms.clone();
         sorted.sort_by(f64::total_cmp);
@@ -136,12 +136,12 @@ impl Watched {
 }
 
 impl Rig {
-    /// Opens the first so many cameras of the test driver.
+    /// Opens the first `cameras` cameras of the test driver.
     pub fn start(cameras: usize) -> Self {
         Self::start_with(&(0..cameras).map(|camera| options(&bus(camera))).collect::<Vec<_>>())
     }
 
-    /// Opens cameras; a failure ends the program, since then there is nothing to test.
+    /// Opens cameras; a failure ends the program, since nothing can be tested then.
     pub fn start_with(wanted: &[CameraOptions]) -> Self {
         let mut sources: Vec<Box<dyn CameraSource>> = Vec::new();
         for (camera, options) in wanted.iter().enumerate() {
@@ -157,7 +157,7 @@ impl Rig {
         Self::of(sources)
     }
 
-    /// Of cameras that are open, called 00, 01 and so on.
+    /// Starts a rig of open cameras with the names 00, 01 and so on.
     pub fn of(sources: Vec<Box<dyn CameraSource>>) -> Self {
         let cameras = sources.len();
         let ids: Vec<_> = sources.iter().map(|source| source.camera().clone()).collect();
@@ -181,14 +181,14 @@ impl Rig {
         }
     }
 
-    /// The same rig with its streams started again.
+    /// Closes the rig and opens it again with the same number of cameras.
     pub fn restarted(self) -> Self {
         let cameras = self.cameras;
         drop(self);
         Self::start(cameras)
     }
 
-    /// Runs for a while and tells of that while alone.
+    /// Runs for `duration` and returns the observations of that interval alone.
     pub fn watch(&mut self, duration: Duration) -> Watched {
         self.seen = vec![Seen::new(); self.cameras];
         self.started = Instant::now();
@@ -209,7 +209,8 @@ impl Rig {
         Watched { complete, partial, cpu_percent, latencies_ms, cameras: self.summary() }
     }
 
-    /// Runs until something is so, or for so long; it sees frames since now, errors and health since the start.
+    /// Runs until the condition holds, for `most` at the longest. It gets frames since this call, and errors and health since the
+    /// start.
     pub fn until(&mut self, most: Duration, is_so: impl Fn(&[Seen]) -> bool) -> Share {
         let start = Instant::now();
         for seen in &mut self.seen {
@@ -243,7 +244,7 @@ impl Rig {
         self.sync.push(frame)
     }
 
-    /// Since the watch began.
+    /// Summarizes the observations since the interval began.
     fn summary(&self) -> Vec<Seen> {
         let seconds = self.started.elapsed().as_secs_f64();
         let now = self.threads.stats();
@@ -261,7 +262,7 @@ impl Rig {
                 mode: now.health.mode.clone(),
                 network: None,
             };
-            // The gap that is still open counts too.
+            // The gap that has not ended counts too.
             let open_gap = last.map_or(0.0, |(at, _)| at.max(self.started).elapsed().as_secs_f64() * 1e3);
             Seen {
                 errors: errors.collect(),
@@ -275,7 +276,7 @@ impl Rig {
         .collect()
     }
 
-    /// As [`Self::summary`], with errors and health since the threads began.
+    /// Returns [`Self::summary`] with errors and health since the threads started.
     pub fn now(&self) -> Vec<Seen> {
         let stats = self.threads.stats();
         let with = |(seen, stats): (&Seen, CameraStats)| Seen {

@@ -1,4 +1,4 @@
-//! The table of faults.
+//! Table of faults.
 
 #[derive(Default)]
 pub struct Table(Vec<([String; 5], bool)>);

@@ -59,7 +59,7 @@ impl Bench {
     fn plug(&mut self, camera: usize, port: usize) -> io::Result<()> {
         let deadline = Instant::now() + Duration::from_secs(5);
         loop {
-            // The port may still be in use by the camera that has just left.
+            // The port may still be in use by the camera that was just unplugged.
             match UvcCamera::plug(port, &serial(camera), Arc::clone(&self.knobs[camera]), Arc::clone(&self.pictures)) {
                 Ok(plugged) => {
                     self.plugged[camera] = Some(plugged);
@@ -80,7 +80,7 @@ fn found() -> usize {
     camera_reports().iter().filter(|report| report.node.serial.as_ref().is_some_and(|s| s.starts_with("FR-"))).count()
 }
 
-/// All of them.
+/// Runs every fault.
 pub fn run(table: &mut Table, cycles: usize) {
     let mut bench = match Bench::new() {
         Ok(bench) => bench,
@@ -108,7 +108,7 @@ fn steady(table: &mut Table) {
             if exposed { "as set" } else { "not set" }
         ),
         "flowing without errors; exposure reads back",
-        &format!("{} a second", rates.join(", ")),
+        &format!("{} per second", rates.join(", ")),
         seen.errors() == 0 && exposed && seen.cameras.iter().all(|camera| camera.frames > 10),
     );
 }
@@ -116,7 +116,7 @@ fn steady(table: &mut Table) {
 fn cut(table: &mut Table, bench: &Bench) {
     let mut rig = Bench::rig();
     rig.watch(Duration::from_secs(2));
-    // A slow machine never sees most of them.
+    // Cut every image: a slow machine receives only a few.
     bench.knobs[0].cut.store(u64::MAX, Ordering::Relaxed);
     let refused = |cameras: &[Seen]| cameras[0].errors_of(CaptureErrorKind::Corrupt) >= 5;
     let in_time = matches!(rig.until(Duration::from_secs(30), refused), Share::After(_));
@@ -137,7 +137,7 @@ fn silent(table: &mut Table, bench: &Bench) {
     let mut rig = Bench::rig();
     rig.watch(Duration::from_secs(2));
     bench.knobs[0].silent.store(true, Ordering::Relaxed);
-    // A slow machine first empties the driver's buffers.
+    // A slow machine first drains the driver's buffers.
     rig.until(Duration::from_secs(15), |cameras| cameras[0].health.silences > 0);
     let noticed = rig.now()[0].silent_ms();
     bench.knobs[0].silent.store(false, Ordering::Relaxed);
@@ -146,7 +146,7 @@ fn silent(table: &mut Table, bench: &Bench) {
         "silent camera (USB)",
         "one camera stalls without an error",
         &format!("noticed {noticed:.0} ms after its last frame, back {:.0} ms after the stall", back.ms()),
-        "500 ms, and what a busy machine takes to look (200)",
+        "500 ms, plus the delay of a busy machine (200)",
         &format!("{noticed:.0} ms"),
         noticed < 700.0 && matches!(back, Share::After(_)),
     );
@@ -155,7 +155,7 @@ fn silent(table: &mut Table, bench: &Bench) {
 fn replugged(table: &mut Table, bench: &mut Bench, cycles: usize) {
     let mut rig = Bench::rig();
     rig.watch(Duration::from_secs(2));
-    // The others by themselves, for comparison: the emulated bus pauses now and then.
+    // Measure the other cameras undisturbed, for comparison: the emulated bus pauses occasionally.
     let usual = rig.watch(Duration::from_secs(10)).cameras[1].longest_gap_ms;
     let (files, running) = (open_files(), threads());
     let (mut slowest, mut failures, mut others): (f64, usize, f64) = (0.0, 0, 0.0);
@@ -164,7 +164,7 @@ fn replugged(table: &mut Table, bench: &mut Bench, cycles: usize) {
         let wanted = rig.now()[0].health.reconnects + 1;
         bench.plugged[0] = None;
         rig.watch(Duration::from_millis(700));
-        // Into another port each time.
+        // Use another port each time.
         if let Err(error) = bench.plug(0, CAMERAS + cycle % 3) {
             println!("plug: {error}");
         }
@@ -186,9 +186,9 @@ fn replugged(table: &mut Table, bench: &mut Bench, cycles: usize) {
             "{failures} times not back; slowest {slowest:.0} ms after the plug; exposure {}",
             if exposed { "set again" } else { "lost" }
         ),
-        "always back within 6 s with its settings; file descriptors and threads as before; others pause at most 500 ms longer than by themselves",
+        "always back within 6 s with its settings; file descriptors and threads as before; others pause at most 500 ms longer than undisturbed",
         &format!(
-            "file descriptors {files} to {files_after}, threads {running} to {running_after}; others' longest gap {others:.0} ms, {usual:.0} ms by themselves"
+            "file descriptors {files} to {files_after}, threads {running} to {running_after}; others' longest gap {others:.0} ms, {usual:.0} ms undisturbed"
         ),
         failures == 0 && exposed && slowest < 6000.0 && files == files_after && running == running_after && others < usual + 500.0,
     );

@@ -1,5 +1,5 @@
-//! USB cameras out of thin air: a UVC device that speaks USB/IP to the kernel's virtual host controller, so that the real
-//! `uvcvideo` driver works on it. It can be unplugged, fall silent, and send broken images.
+//! Emulated USB camera: a UVC device that speaks USB/IP to the kernel's virtual host controller, so that the real `uvcvideo`
+//! driver handles it. It can be unplugged, stop sending, and send truncated images.
 
 use std::{
     collections::VecDeque,
@@ -21,15 +21,15 @@ const WIDTH: u16 = 640;
 const HEIGHT: u16 = 360;
 const FRAME_BYTES: u32 = WIDTH as u32 * HEIGHT as u32 * 2;
 const PERIOD: Duration = Duration::from_micros(33_333);
-/// Intervals of 30 and 15 frames a second in UVC's unit.
+/// Frame intervals of 30 and 15 frames per second, in units of 100 ns.
 const INTERVALS: [u32; 2] = [333_333, 666_666];
 
-/// What tests do to a camera while it streams.
+/// Faults that tests inject while a camera streams.
 #[derive(Debug, Default)]
 pub struct Knobs {
-    /// Sends nothing.
+    /// Whether the camera stops sending.
     pub silent: AtomicBool,
-    /// So many of the next images are cut off in the middle.
+    /// Number of the next images that are truncated in the middle.
     pub cut: AtomicU64,
 }
 
@@ -37,13 +37,13 @@ pub struct Knobs {
 struct Shared {
     knobs: Arc<Knobs>,
     out: Mutex<UnixStream>,
-    /// Waiting transfers: number as the kernel wrote it, and room.
+    /// Pending transfers: the kernel's sequence number, and the capacity in bytes.
     waiting: Mutex<VecDeque<([u8; 4], usize)>>,
     changed: Condvar,
     gone: AtomicBool,
 }
 
-/// A plugged-in camera; dropping it pulls the plug.
+/// Plugged-in camera; dropping it unplugs it.
 #[derive(Debug)]
 pub struct UvcCamera {
     shared: Arc<Shared>,
@@ -54,7 +54,7 @@ impl UvcCamera {
     /// Plugs a camera into a port of the virtual controller.
     pub fn plug(port: usize, serial: &str, knobs: Arc<Knobs>, pictures: Arc<Vec<Vec<u8>>>) -> io::Result<Self> {
         let (ours, kernels) = UnixStream::pair()?;
-        // Port, socket, device number, and speed: 3 is USB 2's.
+        // Port, socket, device number and speed; 3 stands for USB 2.
         fs::write(ATTACH, format!("{port} {} {} 3", kernels.as_raw_fd(), port + 1))?;
         let requests = ours.try_clone()?;
         let shared = Arc::new(Shared {
@@ -68,7 +68,7 @@ impl UvcCamera {
         let serial = serial.to_owned();
         let threads = vec![
             Builder::new().name("uvc requests".to_owned()).spawn(move || {
-                // Ends when the plug is pulled.
+                // Ends when the camera is unplugged.
                 let _ = answer(requests, &for_requests, &serial);
                 for_requests.gone.store(true, Ordering::Relaxed);
                 for_requests.changed.notify_all();
@@ -92,7 +92,7 @@ impl Drop for UvcCamera {
     }
 }
 
-/// JPEG images of something that moves.
+/// Returns JPEG images of a moving bar.
 pub fn pictures() -> Vec<Vec<u8>> {
     let picture = |n: u32| {
         let (width, height) = (u32::from(WIDTH), u32::from(HEIGHT));
@@ -101,7 +101,7 @@ pub fn pictures() -> Vec<Vec<u8>> {
             image::Rgb(if bar { [230, 200, 40] } else { [(x / 3) as u8, (y / 2) as u8, 90] })
         });
         let mut bytes = Cursor::new(Vec::new());
-        // Into memory it cannot fail.
+        // Writing to memory cannot fail.
         let _ = image.write_to(&mut bytes, image::ImageFormat::Jpeg);
         bytes.into_inner()
     };
@@ -195,7 +195,7 @@ fn send_images(shared: &Shared, pictures: &[Vec<u8>]) -> io::Result<()> {
             }
             let Some((sequence, room)) = waiting.pop_front() else { continue };
             let (now, later) = rest.split_at(rest.len().min(room));
-            // Under the lock: nobody may say of a transfer that it is over before it is.
+            // Hold the lock: no thread may report a transfer as complete before it is.
             complete(&mut lock(&shared.out), sequence, 0, now.len(), now)?;
             drop(waiting);
             rest = later;
@@ -207,7 +207,7 @@ fn send_images(shared: &Shared, pictures: &[Vec<u8>]) -> io::Result<()> {
     Ok(())
 }
 
-/// The device's answers to control requests.
+/// Control endpoint of the device.
 struct Device {
     strings: [String; 3],
     probe: Vec<u8>,
@@ -226,7 +226,7 @@ impl Device {
         device
     }
 
-    /// Takes what the host wants as far as the camera has it.
+    /// Accepts the host's requested values that the camera supports.
     fn negotiate(&mut self, wanted: &[u8]) {
         let interval = wanted.get(4..8).map_or(0, |bytes| u32::from_le_bytes([bytes[0], bytes[1], bytes[2], bytes[3]]));
         let interval = if interval == INTERVALS[1] { INTERVALS[1] } else { INTERVALS[0] };
@@ -263,7 +263,7 @@ impl Device {
                 self.negotiate(sent);
                 Some(Vec::new())
             }
-            // The camera terminal: mode and time of exposure.
+            // Camera terminal: exposure mode and time.
             (0xa1, 0x86) if entity == 1 => Some(vec![3]),
             (0xa1, 0x85) if entity == 1 => Some(vec![if high == 2 { 1 } else { 4 }, 0]),
             (0xa1, what) if entity == 1 && high == 2 => Some(vec![if what == 0x84 {
@@ -298,7 +298,7 @@ impl Device {
 
 const DEVICE: [u8; 18] = [18, 1, 0, 2, 0xef, 2, 1, 64, 0x6b, 0x1d, 5, 1, 0, 1, 1, 2, 3, 1];
 
-/// One frame size in two rates, as a descriptor of MJPEG (7) or uncompressed (5) frames.
+/// Returns the descriptor of one frame size at two rates, for MJPEG (7) or uncompressed (5) frames.
 fn frame(kind: u8) -> Vec<u8> {
     let mut bytes = vec![34, 0x24, kind, 1, 0];
     bytes.extend([WIDTH, HEIGHT].into_iter().flat_map(u16::to_le_bytes));
