@@ -51,7 +51,7 @@ fn a_key_file_is_all_that_another_computer_needs() {
     refused(&["capture", "cameras.toml", "--key", "desk.key"], "desk.key: is a key of role viewer");
     refused(&["watch", "left-pc.key", "--seconds", "1"], "left-pc.key: is a key of role cameras");
     refused(&["watch", "cameras.toml", "--seconds", "1"], "cameras.toml: is no key");
-    refused(&["watch", "desk.key", "--record", "x.mcap", "--seconds", "5"], "nobody answers at 127.0.0.1");
+    refused(&["watch", "desk.key", "--record", "x.mcap", "--seconds", "5"], "no rig answers at 127.0.0.1");
 
     // The camera computer gets the rig's address from its key, and does not listen.
     let mut cameras = Command::new(PROGRAM);

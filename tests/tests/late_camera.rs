@@ -108,7 +108,7 @@ fn a_recording_that_breaks_off_fails_the_command_after_a_clean_end() {
     std::fs::write(folder.path().join("take-0002.mcap"), "").unwrap();
     let broken = command(&["run", "rig.toml", "--record", "take.mcap"]);
     assert_eq!(broken.code, Some(1), "{broken:?}");
-    assert!(broken.stderr.contains("run: 20 sets"), "the rig must go on: {}", broken.stderr);
+    assert!(broken.stderr.contains("run: 20 frame sets"), "the rig must go on: {}", broken.stderr);
     assert!(broken.stderr.contains("error: the recording broke off after"), "{}", broken.stderr);
     assert!(broken.stderr.contains("take-0002.mcap cannot be created"), "{}", broken.stderr);
 }

@@ -25,7 +25,7 @@ fn a_rig_measures_a_new_person_and_then_tracks_them() {
     assert_eq!(ran.code, Some(0), "{}", ran.stderr);
     assert!(ran.stderr.contains("person 0 is 1."), "{}", ran.stderr);
     assert!(!ran.stderr.contains("person 1 is"), "only one person is in view: {}", ran.stderr);
-    assert!(ran.stderr.contains("run: 22 sets"), "{}", ran.stderr);
+    assert!(ran.stderr.contains("run: 22 frame sets"), "{}", ran.stderr);
 
     std::fs::write(folder.path().join("rig.toml"), format!("{RIG}[perception]\npeople = 5\n")).unwrap();
     let refused = run(PROGRAM, &["run", "rig.toml"], folder.path()).unwrap();
@@ -56,7 +56,7 @@ fn a_signal_starts_a_new_measurement() {
     }
     let said = said.join("\n");
     assert!(rig.wait().unwrap().success(), "{said}");
-    assert_eq!(said.matches("SIGUSR1, everybody is measured again").count(), 1, "{said}");
+    assert_eq!(said.matches("SIGUSR1, all people are measured again").count(), 1, "{said}");
     assert_eq!(said.matches("person 0 was measured again: 1.").count(), 1, "{said}");
 }
 

@@ -54,7 +54,7 @@ fn with_clock(camera: &CameraHealth) -> Option<NetworkHealth> {
 // The library adds "_total" to the name of a counter.
 const CAMERA_COUNTERS: [Counter; 12] = [
     ("frames", "Frames that came.", |c| Some(c.stats.frames)),
-    ("frames_lost_before_us", "Frames that the driver numbered and nobody got.", |c| {
+    ("frames_lost_before_us", "Frames numbered by the driver that never arrived.", |c| {
         Some(c.stats.health.lost_by_driver)
     }),
     ("frames_waited_too_long", "Frames dropped because the rig was busy.", |c| Some(c.stats.dropped)),
@@ -137,7 +137,7 @@ impl Collector for Snapshot {
         page.gauges("stage_seconds", "Time of a stage of the pipeline.", stages)?;
         if let Some(budget) = health.budget {
             page.gauge("effort_level", "What is left out to keep to the budget; 0: nothing.", i64::from(budget.level))?;
-            page.gauge("budget_rate", "Sets a second that are wanted.", budget.fps)?;
+            page.gauge("budget_rate", "Requested frame sets per second.", budget.fps)?;
             page.gauge("set_seconds", "Smoothed cost of a set.", budget.set_secs)?;
         }
         page.counter("device_faults", "Times that the graphics device was opened again.", health.device_faults)?;

@@ -88,7 +88,7 @@ pub fn table(health: &Health, recorded: Option<&Recorded>) -> String {
     );
     if let Some(budget) = health.budget {
         let (fps, ms) = (budget.fps, 1e3 * budget.set_secs);
-        let _ = writeln!(text, "budget: {fps} sets a second, {}, {ms:.0} ms a set", effort(budget));
+        let _ = writeln!(text, "budget: {fps} frame sets per second, {}, {ms:.0} ms each", effort(budget));
     }
     for (thread, count) in thread_restarts(health).into_iter().filter(|(_, count)| *count > 0) {
         let _ = writeln!(text, "thread '{thread}': restarted {count} times");
@@ -207,7 +207,10 @@ pub mod tests {
         let last: Vec<&str> = table.lines().skip(2).collect();
         assert_eq!(
             last,
-            ["sets: 800 complete, 10 partial, 4 skipped", "budget: 5 sets a second, effort 5 of 7, 150 ms a set"]
+            [
+                "sets: 800 complete, 10 partial, 4 skipped",
+                "budget: 5 frame sets per second, effort 5 of 7, 150 ms each"
+            ]
         );
     }
 }

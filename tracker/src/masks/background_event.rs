@@ -23,18 +23,18 @@ impl fmt::Display for BackgroundEvent {
             Self::Changed(share) => write!(
                 f,
                 "{:.0} % of the background differs from the plate (lights switched, or a plate of another scene); masks do \
-                 without the plate until the background has been relearnt, where nobody stands",
+                 without the plate until the background has been relearnt where no person stands",
                 100.0 * share
             ),
             Self::Recovered => f.write_str("the background has been relearnt and is in use again"),
             Self::Shifted(x, y) => write!(
                 f,
                 "the image is shifted by {x}, {y} pixels against the plate: the camera was moved; calibrate again and \
-                 record new plates (`flyrig plate`); until then masks learn the background where nobody stands"
+                 record new plates (`flyrig plate`); until then masks learn the background where no person stands"
             ),
             Self::Differs(share, [x, y]) => write!(
                 f,
-                "{:.1} % of the image around pixel {x}, {y} differ from the plate where nobody is tracked: something was moved, \
+                "{:.1} % of the image around pixel {x}, {y} differ from the plate away from tracked people: something was moved, \
                  or a person stood in the plate; it is being relearnt; recording the plate again (`flyrig plate`) is more accurate",
                 100.0 * share
             ),

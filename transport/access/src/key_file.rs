@@ -139,7 +139,7 @@ impl KeyFile {
     pub fn write_new(&self, path: &Path) -> Result<(), AccessError> {
         let body = toml::to_string(self).map_err(AccessError::system)?;
         let text = format!(
-            "# Key of '{}' ({}) to the rig '{}', valid until {}.\n# Keep it secret: whoever has this file is '{}'.\n{body}",
+            "# Key of '{}' ({}) to the rig '{}', valid until {}.\n# Keep it secret: its holder connects as '{}'.\n{body}",
             self.holder,
             self.role.name(),
             self.rig,

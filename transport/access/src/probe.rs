@@ -67,7 +67,7 @@ impl KeyFile {
                 Err(error) => {
                     let source = if self.role == Role::Cameras { " and source.kind = \"network\"" } else { "" };
                     problem = format!(
-                        "nobody answers at {address} ({error}); is `flyrig run` up there, with transport.keys{source}?"
+                        "no rig answers at {address} ({error}); is `flyrig run` up there, with transport.keys{source}?"
                     );
                 }
             }

@@ -86,7 +86,7 @@ impl<'a> LiveRun<'a> {
 
     /// Ends the rig, prints its counts, and saves the person.
     pub fn finish(mut self) -> Result<()> {
-        eprintln!("run: {} sets in {:.1} s", self.rig.frames(), self.started.elapsed().as_secs_f64());
+        eprintln!("run: {} frame sets in {:.1} s", self.rig.frames(), self.started.elapsed().as_secs_f64());
         eprint!("{}", self.rig.session.stages.table());
         for (place, count) in self.rig.drops().into_iter().filter(|(_, count)| *count > 0) {
             eprintln!("dropped: {count} {place}");
@@ -109,7 +109,7 @@ impl<'a> LiveRun<'a> {
 
     fn measure_again(&mut self) {
         if self.rig.session.measure_again() {
-            eprintln!("run: SIGUSR1, everybody is measured again");
+            eprintln!("run: SIGUSR1, all people are measured again");
         } else {
             eprintln!(
                 "run: SIGUSR1, but no person is measured: perception.shape is \"given\", or there is only one camera"
@@ -152,7 +152,7 @@ impl<'a> LiveRun<'a> {
         let session = &self.rig.session;
         let lost = session.counts.lost;
         let effort = session.budget.stats().map_or_else(String::new, |budget| format!(", {}", effort(budget)));
-        eprintln!("run: {frames} sets, {rate:.1} per second, {lost} lost{memory}{effort}");
+        eprintln!("run: {frames} frame sets, {rate:.1} per second, {lost} lost{memory}{effort}");
         (*last, *printed) = (Instant::now(), frames);
     }
 }

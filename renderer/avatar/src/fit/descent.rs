@@ -154,7 +154,7 @@ impl Fit {
         settings: FitSettings,
     ) -> Result<Self, AvatarError> {
         if views.is_empty() {
-            return Err(AvatarError::Images("nobody is in any image; check masks, cameras and frames".to_owned()));
+            return Err(AvatarError::Images("no person is in any image; check masks, cameras and frames".to_owned()));
         }
         if views.iter().any(|view| view.frame >= frames.len()) {
             return Err(AvatarError::Images("an image is of a frame without a pose".to_owned()));

@@ -147,7 +147,7 @@ impl TransportConfig {
             } else {
                 format!(
                     "make keys for those who may: `flyrig keys new {} --host NAME-OF-THIS-COMPUTER`, and transport.keys = \"{}-keys\"; or set \
-                     transport.insecure = true (--insecure) in a network that is yours alone",
+                     transport.insecure = true (--insecure) in a trusted network",
                     self.rig, self.rig
                 )
             };

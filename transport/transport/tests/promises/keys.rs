@@ -206,7 +206,7 @@ fn a_missing_or_foreign_key_is_reported() {
     let reason = refused(at_ours(&cameras));
     assert!(reason.contains("has another port"), "{reason}");
     let nowhere = KeyFile { connect: vec!["127.0.0.1:1".to_owned()], ..desk.clone() };
-    assert!(refused(nowhere).contains("nobody answers at 127.0.0.1:1"));
+    assert!(refused(nowhere).contains("no rig answers at 127.0.0.1:1"));
     desk.knock().unwrap();
     // Nothing comes to any of them.
     for key in [at_ours(&spy), forged] {
@@ -277,7 +277,7 @@ fn viewers_come_back_when_the_rig_does() {
     // First of all, the viewer.
     let viewer = open_viewer(&key, &everything());
     let trouble = wait_for("a reason", || viewer.trouble());
-    assert!(trouble.contains("nobody answers at 127.0.0.1"), "{trouble}");
+    assert!(trouble.contains("no rig answers at 127.0.0.1"), "{trouble}");
     let mut frame = 0;
     for _ in 0..2 {
         let rig = open_rig(&ring);
@@ -342,7 +342,7 @@ fn a_relay_passes_people_on_to_its_own_viewers() {
     let relay = Relay::start(&TransportConfig::with_key(key), &to).unwrap();
     let viewer = open_viewer(&guest, &everything());
     let beside = Subscriber::open(&subscriber_config(&[endpoint]), &everything()).unwrap();
-    let trouble = wait_for("the reason", || relay.trouble().filter(|text| text.contains("nobody answers at")));
+    let trouble = wait_for("the reason", || relay.trouble().filter(|text| text.contains("no rig answers at")));
     assert!(trouble.contains("rig test"), "{trouble}");
     assert_eq!(viewer.publishers(), 0);
     for gaussians in [20_000, 30_000] {

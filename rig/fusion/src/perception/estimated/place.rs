@@ -173,7 +173,7 @@ impl PersonPlace {
             match (self.is_known, is_other, self.renews) {
                 (false, ..) => tracing::info!("person {} is {fit}", self.id),
                 (.., true) => tracing::info!("person {} was measured again: {fit}", self.id),
-                (_, true, _) => tracing::info!("person {} is somebody else now, {fit}", self.id),
+                (_, true, _) => tracing::info!("person {} is another person now, {fit}", self.id),
                 // A person who comes back keeps the shape, and with it the colours.
                 _ => return Ok(()),
             }

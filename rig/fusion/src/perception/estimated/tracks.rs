@@ -23,7 +23,8 @@ const LEFT_AFTER_NANOS: u64 = 3_000_000_000;
 impl EstimatedPerception {
     /// Estimates all people in a frame set, one element per place: those who are followed first, then one search for the others.
     pub(super) fn estimate(&mut self, set: &FrameSet, stages: &mut StageTimes) -> Vec<PlaceEstimate> {
-        let mut estimates: Vec<PlaceEstimate> = self.places.iter().map(|_| Err("nobody is here".to_owned())).collect();
+        let mut estimates: Vec<PlaceEstimate> =
+            self.places.iter().map(|_| Err("no person is here".to_owned())).collect();
         let mut order: Vec<usize> = (0..self.places.len()).collect();
         order.sort_by_key(|&index| self.places[index].is_lost());
         let mut may_search = true;
@@ -70,7 +71,7 @@ impl EstimatedPerception {
         let (low, high) = self.places.split_at_mut(index.max(other));
         let (to, from) = if other < index { (&mut low[other], &mut high[0]) } else { (&mut high[0], &mut low[index]) };
         to.estimator.take_track(&mut from.estimator);
-        Err("this is somebody else".to_owned())
+        Err("this is another person".to_owned())
     }
 
     /// Drops one of two tracks that follow the same person: the one that explains the images less well.
