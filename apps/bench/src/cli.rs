@@ -1,8 +1,7 @@
 //! The command line of `flyrig-bench`.
 
-use std::path::PathBuf;
-
 use clap::{Parser, Subcommand};
+use flyrig_report::arguments::ProgramArgs;
 
 use crate::{
     appearance::BenchAppearanceArgs,
@@ -24,15 +23,8 @@ use crate::{
 #[derive(Debug, Parser)]
 #[command(name = "flyrig-bench", version)]
 pub struct BenchCli {
-    /// Log more: -v debug, -vv trace. RUST_LOG selects modules.
-    #[arg(short, long, global = true, action = clap::ArgAction::Count)]
-    pub verbose: u8,
-    /// Part of a graphics adapter's name; the fastest adapter otherwise.
-    #[arg(long, global = true)]
-    pub adapter: Option<String>,
-    /// Write when each stage ran into this file, for Perfetto (ui.perfetto.dev) or about:tracing.
-    #[arg(long, global = true, value_name = "FILE")]
-    pub trace: Option<PathBuf>,
+    #[command(flatten)]
+    pub program: ProgramArgs,
     #[command(subcommand)]
     pub command: BenchCommand,
 }

@@ -29,12 +29,12 @@ fn main() -> ExitCode {
     // SAFETY: no other thread runs yet.
     unsafe { flyrig_transport::use_one_network_thread() };
     let cli = BenchCli::parse();
-    program::start_log(cli.verbose, false);
-    program::exit_code(traced(cli.trace.as_deref(), || dispatch(&cli)))
+    program::start_log(cli.program.verbose, false);
+    program::exit_code(traced(cli.program.trace.as_deref(), || dispatch(&cli)))
 }
 
 fn dispatch(cli: &BenchCli) -> Result<()> {
-    let gpu = || open_gpu(cli.adapter.as_deref());
+    let gpu = || open_gpu(cli.program.adapter.as_deref());
     match &cli.command {
         BenchCommand::Track(args) => deformation::track::track(args, &gpu()?),
         BenchCommand::Endure(args) => deformation::endure::endure(args, &gpu()?),

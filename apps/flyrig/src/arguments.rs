@@ -2,12 +2,17 @@
 
 use std::{collections::BTreeMap, path::PathBuf};
 
+use anyhow::Result;
 use clap::Args;
 use flyrig_access::{AccessError, KeyFile, Role};
 use flyrig_fusion::{PerceptionSettings, TrackingSettings};
+use flyrig_gpu::GpuContext;
 use flyrig_report::arguments::{FpsArgs, FramesArgs, parse_seconds};
+use flyrig_takes::{Take, TakeOptions};
 use flyrig_transport::TransportConfig;
 use flyrig_types::CameraId;
+
+use crate::opening::open_take;
 
 /// Cameras to read: live ones or a take.
 #[derive(Debug, Clone, Args)]
@@ -38,6 +43,29 @@ pub struct CalibrationArgs {
     pub calibration: Option<PathBuf>,
 }
 
+/// Cameras with a calibration, and the part of them that is used.
+#[derive(Debug, Clone, Args)]
+pub struct CalibratedInputArgs {
+    #[command(flatten)]
+    pub source: InputArgs,
+    #[command(flatten)]
+    pub calibration: CalibrationArgs,
+    #[command(flatten)]
+    pub span: SpanArgs,
+}
+
+impl CalibratedInputArgs {
+    /// Opens the take. `gpu` opens a graphics adapter, for simulated cameras alone.
+    ///
+    /// # Errors
+    /// Names a file, camera or setting that is missing or wrong.
+    pub fn open(&self, gpu: &dyn Fn() -> Result<GpuContext>) -> Result<Take> {
+        let calibration = self.calibration.calibration.as_deref();
+        let options = TakeOptions { fps: self.source.rate.fps, calibration, ..TakeOptions::default() };
+        open_take(&self.source.input, &options, gpu)
+    }
+}
+
 /// Folder that a command writes a calibration, a board or plates to.
 #[derive(Debug, Clone, Args)]
 pub struct TargetArgs {
@@ -60,6 +88,8 @@ pub struct BoardArgs {
 /// Inputs of the calibration of a rig from boards.
 #[derive(Debug, Clone, Args)]
 pub struct SolveArgs {
+    #[command(flatten)]
+    pub board: BoardArgs,
     /// Folder of `flyrig calibrate lens`, or of any calibration, whose lenses are used; without it the lenses are calibrated from the
     /// same boards.
     #[arg(long)]

@@ -3,6 +3,7 @@
 use std::path::PathBuf;
 
 use clap::{Parser, Subcommand};
+use flyrig_report::arguments::ProgramArgs;
 use flyrig_training::TrainArgs;
 
 use crate::{
@@ -28,15 +29,8 @@ pub struct Cli {
     /// Log one JSON object per line.
     #[arg(long, global = true)]
     pub log_json: bool,
-    /// Log more: -v debug, -vv trace. RUST_LOG selects modules.
-    #[arg(short, long, global = true, action = clap::ArgAction::Count)]
-    pub verbose: u8,
-    /// Part of a graphics adapter's name; the fastest adapter otherwise.
-    #[arg(long, global = true)]
-    pub adapter: Option<String>,
-    /// Write when each stage ran into this file, for Perfetto (ui.perfetto.dev) or about:tracing.
-    #[arg(long, global = true, value_name = "FILE")]
-    pub trace: Option<PathBuf>,
+    #[command(flatten)]
+    pub program: ProgramArgs,
     #[command(subcommand)]
     pub command: Command,
 }

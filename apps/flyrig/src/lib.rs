@@ -68,36 +68,36 @@ pub fn main() -> ExitCode {
     // SAFETY: no other thread runs yet.
     unsafe { flyrig_transport::use_one_network_thread() };
     let cli = Cli::parse();
-    program::start_log(cli.verbose, cli.log_json);
-    program::exit_code(traced(cli.trace.as_deref(), || dispatch(&cli)))
+    program::start_log(cli.program.verbose, cli.log_json);
+    program::exit_code(traced(cli.program.trace.as_deref(), || dispatch(&cli)))
 }
 
 fn dispatch(cli: &Cli) -> Result<()> {
     match &cli.command {
-        Command::Demo(args) => demo::demo(args, &open_gpu(cli.adapter.as_deref())?),
+        Command::Demo(args) => demo::demo(args, &open_gpu(cli.program.adapter.as_deref())?),
         Command::Run { config, record, table } => {
             let config = Config::load(config)?;
-            let adapter = cli.adapter.as_deref().or(Some(config.gpu.adapter.as_str()));
+            let adapter = cli.program.adapter.as_deref().or(Some(config.gpu.adapter.as_str()));
             run::run(&config, &open_gpu(adapter)?, record.as_deref(), *table)
         }
         Command::Record(args) => {
             let config = Config::load_for_capture(&args.config)?;
-            let adapter = cli.adapter.as_deref().or(Some(config.gpu.adapter.as_str()));
+            let adapter = cli.program.adapter.as_deref().or(Some(config.gpu.adapter.as_str()));
             let gpu = (config.source.kind == SourceKind::Sim).then(|| open_gpu(adapter)).transpose()?;
             recording::record(&config, args, gpu.as_ref())
         }
         Command::Capture { config, key } => {
             let config = Config::load_for_capture(config)?;
-            let adapter = cli.adapter.as_deref().or(Some(config.gpu.adapter.as_str()));
+            let adapter = cli.program.adapter.as_deref().or(Some(config.gpu.adapter.as_str()));
             let gpu = (config.source.kind == SourceKind::Sim).then(|| open_gpu(adapter)).transpose()?;
             capture::capture(&config, key.as_deref(), gpu.as_ref())
         }
         Command::Replay(args) => replay::replay(args),
-        Command::SyncCheck(args) => sync_check::sync_check(args, &|| open_gpu(cli.adapter.as_deref())),
-        Command::Plate(args) => plate::plate(args, &|| open_gpu(cli.adapter.as_deref())),
-        Command::Calibrate { action } => calibrate::calibrate(action, &|| open_gpu(cli.adapter.as_deref())),
+        Command::SyncCheck(args) => sync_check::sync_check(args, &|| open_gpu(cli.program.adapter.as_deref())),
+        Command::Plate(args) => plate::plate(args, &|| open_gpu(cli.program.adapter.as_deref())),
+        Command::Calibrate { action } => calibrate::calibrate(action, &|| open_gpu(cli.program.adapter.as_deref())),
         Command::Doctor { config } => doctor::doctor(config.as_deref()),
-        Command::View(args) => view::view(args, &open_gpu(cli.adapter.as_deref())?),
+        Command::View(args) => view::view(args, &open_gpu(cli.program.adapter.as_deref())?),
         Command::Serve(args) => serve::serve(args),
         Command::Watch(args) => match &args.record {
             Some(path) => stream_recording::record(args, path),
@@ -105,17 +105,17 @@ fn dispatch(cli: &Cli) -> Result<()> {
         },
         Command::Keys { action } => keys::keys(action),
         Command::Play(args) => stream_recording::play(args),
-        Command::Avatar { action } => avatar::avatar(action, &|| open_gpu(cli.adapter.as_deref())),
-        Command::Eval(args) => eval::eval(args, &open_gpu(cli.adapter.as_deref())?),
+        Command::Avatar { action } => avatar::avatar(action, &|| open_gpu(cli.program.adapter.as_deref())),
+        Command::Eval(args) => eval::eval(args, &open_gpu(cli.program.adapter.as_deref())?),
         Command::Sim { action: SimAction::Export(args) } => {
             let config = args.config.as_deref().map(simulator_file::load).transpose()?.unwrap_or_default();
-            sim_export::sim_export(args, &config, &open_gpu(cli.adapter.as_deref())?)
+            sim_export::sim_export(args, &config, &open_gpu(cli.program.adapter.as_deref())?)
         }
         Command::Sim { action: SimAction::Print } => {
             print!("{}", simulator_file::DEFAULT_TOML);
             Ok(())
         }
-        Command::Train(args) => flyrig_training::train(args, &|| open_gpu(cli.adapter.as_deref())),
+        Command::Train(args) => flyrig_training::train(args, &|| open_gpu(cli.program.adapter.as_deref())),
         Command::Config { action: ConfigAction::Print } => {
             print!("{DEFAULT_TOML}");
             Ok(())

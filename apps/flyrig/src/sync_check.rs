@@ -10,13 +10,10 @@ use flyrig_report::stop;
 use flyrig_sync::{
     ClockKind, LagEstimate, MotionSignal, SilhouetteTrack, SyncSettings, estimate_lags, estimate_silhouette_lags,
 };
-use flyrig_takes::{Calibration, SilhouetteFinder, Take, TakeOptions, TakeSpan};
+use flyrig_takes::{Calibration, SilhouetteFinder, Take, TakeSpan};
 use flyrig_types::{CameraId, Image, Rig};
 
-use crate::{
-    arguments::{CalibrationArgs, InputArgs, SpanArgs, parse_most_ms},
-    opening::open_take,
-};
+use crate::arguments::{CalibratedInputArgs, parse_most_ms};
 
 /// Arguments of `flyrig sync-check`.
 #[derive(Debug, Args)]
@@ -26,11 +23,7 @@ pub struct SyncCheckArgs {
     #[arg(long, default_value_t = 250.0, value_parser = parse_most_ms)]
     pub most_ms: f64,
     #[command(flatten)]
-    pub source: InputArgs,
-    #[command(flatten)]
-    pub calibration: CalibrationArgs,
-    #[command(flatten)]
-    pub span: SpanArgs,
+    pub input: CalibratedInputArgs,
 }
 
 const ADD_TO_CAMERA: &str = "add it to the lag_ms that its [[source.cameras]] has (0 without one)";
@@ -39,9 +32,7 @@ const ADD: &str = "add it to the camera's time_offset_ms in calibration.toml, or
 /// Runs the command. `gpu` opens a graphics adapter, for simulated cameras alone.
 pub fn sync_check(args: &SyncCheckArgs, gpu: &dyn Fn() -> Result<GpuContext>) -> Result<()> {
     stop::flag();
-    let calibration = args.calibration.calibration.as_deref();
-    let options = TakeOptions { fps: args.source.rate.fps, calibration, ..TakeOptions::default() };
-    let mut take = open_take(&args.source.input, &options, gpu)?;
+    let mut take = args.input.open(gpu)?;
     let cameras: Vec<CameraId> = take.sources.iter().map(|source| source.camera().clone()).collect();
     ensure!(cameras.len() > 1, "a time offset needs at least two cameras; name another one");
     let advice = if take.is_live { ADD_TO_CAMERA } else { ADD };
@@ -60,7 +51,10 @@ pub fn sync_check(args: &SyncCheckArgs, gpu: &dyn Fn() -> Result<GpuContext>) ->
                  tells no lag; record the take and check the recording"
             );
             if take.is_live {
-                eprintln!("sync-check: jump and wave both arms before all cameras for {} s, please", args.span.secs);
+                eprintln!(
+                    "sync-check: jump and wave both arms before all cameras for {} s, please",
+                    args.input.span.secs
+                );
             }
             let (estimates, frames) = by_motion(args, take.sources, &cameras, &take.sync, take.is_live)?;
             let advice_if_missing = "its motion does not correlate with that of other cameras, is too slow, or too short (under five seconds): jump and wave both \
@@ -100,7 +94,8 @@ fn by_motion(
             Ok(frame) => frame,
             Err(PopError::Closed) => break,
             Err(PopError::Timeout)
-                if is_live && started.elapsed().as_secs_f64() > args.span.from_secs + args.span.secs + 5.0 =>
+                if is_live
+                    && started.elapsed().as_secs_f64() > args.input.span.from_secs + args.input.span.secs + 5.0 =>
             {
                 break;
             }
@@ -108,10 +103,10 @@ fn by_motion(
         };
         let from = *first.get_or_insert(frame.capture_nanos);
         let at = frame.capture_nanos.saturating_sub(from) as f64 * 1e-9;
-        if at > args.span.from_secs + args.span.secs {
+        if at > args.input.span.from_secs + args.input.span.secs {
             break;
         }
-        if at < args.span.from_secs {
+        if at < args.input.span.from_secs {
             continue;
         }
         let image = &frame.image;
@@ -155,7 +150,8 @@ fn by_silhouettes(
     let mut pictures = vec![0usize; rig.cameras.len()];
     // One camera may lead by as much as another lags.
     let spread_nanos = (args.most_ms * 2e6) as u64;
-    let span = TakeSpan { secs: [args.span.from_secs, args.span.from_secs + args.span.secs], spread_nanos };
+    let span =
+        TakeSpan { secs: [args.input.span.from_secs, args.input.span.from_secs + args.input.span.secs], spread_nanos };
     let errors = take.for_each_set(rig, span, "silhouettes, ms of the take", |set| {
         set.present().for_each(|(slot, _)| pictures[slot] += 1);
         silhouettes.add(set)
@@ -172,6 +168,7 @@ fn by_silhouettes(
 
 #[cfg(test)]
 mod tests {
+    use crate::arguments::{CalibrationArgs, InputArgs, SpanArgs};
     use flyrig_capture::CameraSource as _;
     use flyrig_gpu::AdapterChoice;
     use flyrig_report::arguments::FpsArgs;
@@ -250,9 +247,11 @@ mod tests {
     fn args() -> SyncCheckArgs {
         SyncCheckArgs {
             most_ms: 250.0,
-            source: InputArgs { input: Vec::new(), rate: FpsArgs { fps: 30.0 } },
-            calibration: CalibrationArgs { calibration: None },
-            span: SpanArgs { secs: 20.0, from_secs: 0.0 },
+            input: CalibratedInputArgs {
+                source: InputArgs { input: Vec::new(), rate: FpsArgs { fps: 30.0 } },
+                calibration: CalibrationArgs { calibration: None },
+                span: SpanArgs { secs: 20.0, from_secs: 0.0 },
+            },
         }
     }
 

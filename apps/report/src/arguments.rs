@@ -8,6 +8,20 @@ use anyhow::{Context as _, Result};
 use clap::{Args, builder::TypedValueParser as _};
 use flyrig_body::DEFAULT_GAUSSIAN_COUNT;
 
+/// Arguments of every command.
+#[derive(Debug, Clone, Args)]
+pub struct ProgramArgs {
+    /// Log more: -v debug, -vv trace. RUST_LOG selects modules.
+    #[arg(short, long, global = true, action = clap::ArgAction::Count)]
+    pub verbose: u8,
+    /// Part of a graphics adapter's name; the fastest adapter otherwise.
+    #[arg(long, global = true)]
+    pub adapter: Option<String>,
+    /// Write when each stage ran into this file, for Perfetto (ui.perfetto.dev) or about:tracing.
+    #[arg(long, global = true, value_name = "FILE")]
+    pub trace: Option<PathBuf>,
+}
+
 /// Folder of a command's results.
 #[derive(Debug, Clone, Args)]
 pub struct OutputArgs {

@@ -14,7 +14,7 @@ use flyrig_gpu::GpuContext;
 use flyrig_metrics::{ScoreSheet, score_view};
 use flyrig_renderer::srgb_from_linear;
 use flyrig_report::{
-    arguments::{GaussiansArgs, OutputArgs},
+    arguments::GaussiansArgs,
     plot::{Line, Plot, Series},
     progress_bar, write_whole,
 };
@@ -43,8 +43,6 @@ pub struct BenchAppearanceArgs {
     #[arg(long)]
     pub weights: Vec<PathBuf>,
     #[command(flatten)]
-    pub output: OutputArgs,
-    #[command(flatten)]
     pub simulation: SimulationArgs,
     #[command(flatten)]
     pub surface: GaussiansArgs,
@@ -68,7 +66,7 @@ struct Row {
 
 /// Runs the command.
 pub fn appearance(args: &BenchAppearanceArgs, gpu: &GpuContext) -> Result<()> {
-    args.output.create()?;
+    args.simulation.output.create()?;
     let networks = networks(&args.weights);
     let modes: Vec<Mode<'_>> = AppearanceMode::value_variants()
         .iter()
@@ -94,7 +92,7 @@ pub fn appearance(args: &BenchAppearanceArgs, gpu: &GpuContext) -> Result<()> {
                 let row = run(gpu, args, &sequence, person, views, mode)?;
                 bar.set_message(format!("{} views, {}: {:.2} dB", row.views, row.mode, row.psnr_db));
                 rows.push(row);
-                write(&args.output.out, &rows)?;
+                write(&args.simulation.output.out, &rows)?;
                 bar.inc(1);
             }
         }
@@ -104,7 +102,7 @@ pub fn appearance(args: &BenchAppearanceArgs, gpu: &GpuContext) -> Result<()> {
     println!(
         "\n{}; appearance.csv, appearance.json and appearance.svg in {}",
         gpu.fastest().adapter_name(),
-        args.output.out.display()
+        args.simulation.output.out.display()
     );
     Ok(())
 }

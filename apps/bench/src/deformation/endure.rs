@@ -8,7 +8,7 @@ use flyrig_fusion::{GivenPerception, Solver, resident_mib};
 use flyrig_gpu::GpuContext;
 use flyrig_metrics::{ScoreSheet, score_view};
 use flyrig_report::{
-    arguments::{GaussiansArgs, OutputArgs},
+    arguments::GaussiansArgs,
     plot::{Line, Plot, Series},
     progress_bar, stop, write_whole,
 };
@@ -31,8 +31,6 @@ pub struct BenchEndureArgs {
     /// Total number of frames.
     #[arg(long, default_value_t = 10_000, value_parser = clap::value_parser!(u64).range(300..=10_000_000))]
     pub frames: u64,
-    #[command(flatten)]
-    pub output: OutputArgs,
     #[command(flatten)]
     pub simulation: SimulationArgs,
     #[command(flatten)]
@@ -57,7 +55,7 @@ struct Point {
 
 /// Runs the command.
 pub fn endure(args: &BenchEndureArgs, gpu: &GpuContext) -> Result<()> {
-    args.output.create()?;
+    args.simulation.output.create()?;
     let config = SequenceConfig {
         motion: SequenceMotion::Turn,
         seed: args.simulation.seed,
@@ -81,15 +79,15 @@ pub fn endure(args: &BenchEndureArgs, gpu: &GpuContext) -> Result<()> {
         })
         .collect();
     let csv = format!("frame,psnr_db,ssim,iou,chamfer_mm,memory_mib\n{}", rows.concat());
-    write_whole(&args.output.out.join("endure.csv"), csv.as_bytes())?;
+    write_whole(&args.simulation.output.out.join("endure.csv"), csv.as_bytes())?;
     for (name, title, of) in [
         ("endure.svg", "Chamfer distance, mm", (|p| p.chamfer_mm) as fn(&Point) -> f64),
         ("memory.svg", "Resident memory, MiB", |p| p.memory_mib),
     ] {
-        write_whole(&args.output.out.join(name), plot(&points, title, of).svg().as_bytes())?;
+        write_whole(&args.simulation.output.out.join(name), plot(&points, title, of).svg().as_bytes())?;
     }
     print!("{}", summary(&points));
-    println!("written to {}: endure.csv, endure.svg, memory.svg", args.output.out.display());
+    println!("written to {}: endure.csv, endure.svg, memory.svg", args.simulation.output.out.display());
     Ok(())
 }
 
@@ -204,8 +202,11 @@ mod tests {
         let sequence = SimulatedSequence::simulate(&gpu, config).unwrap();
         let args = BenchEndureArgs {
             frames: 15,
-            output: OutputArgs { out: "out".into() },
-            simulation: SimulationArgs { seed: 1, side: 64 },
+            simulation: SimulationArgs {
+                output: flyrig_report::arguments::OutputArgs { out: "out".into() },
+                seed: 1,
+                side: 64,
+            },
             surface: GaussiansArgs { gaussians: 2000 },
         };
         let mut last = 0;

@@ -4,10 +4,7 @@ use anyhow::{Result, ensure};
 use clap::{Args, builder::TypedValueParser as _};
 use flyrig_fusion::{PAPER_COLOR_WEIGHT, Solver};
 use flyrig_gpu::GpuContext;
-use flyrig_report::{
-    arguments::{GaussiansArgs, OutputArgs},
-    progress_bar,
-};
+use flyrig_report::{arguments::GaussiansArgs, progress_bar};
 use flyrig_tracker::DeformSolver;
 
 use super::{
@@ -34,8 +31,6 @@ pub struct BenchTrackArgs {
     #[arg(long)]
     pub only: Option<String>,
     #[command(flatten)]
-    pub output: OutputArgs,
-    #[command(flatten)]
     pub simulation: SimulationArgs,
     #[command(flatten)]
     pub surface: GaussiansArgs,
@@ -43,7 +38,7 @@ pub struct BenchTrackArgs {
 
 /// Runs the command.
 pub fn track(args: &BenchTrackArgs, gpu: &GpuContext) -> Result<()> {
-    args.output.create()?;
+    args.simulation.output.create()?;
     let mut cases = grid(args);
     if let Some(only) = &args.only {
         let names: Vec<String> = cases.iter().map(Case::name).collect();
@@ -61,7 +56,7 @@ pub fn track(args: &BenchTrackArgs, gpu: &GpuContext) -> Result<()> {
         };
         rows.push(run_case(gpu, &scene, &case)?);
         // After every case, so that a run that is stopped leaves what it has.
-        write::all(&args.output.out, &gpu.fastest().adapter_name(), &rows)?;
+        write::all(&args.simulation.output.out, &gpu.fastest().adapter_name(), &rows)?;
         sequence = Some(scene);
         bar.inc(1);
     }
@@ -69,7 +64,7 @@ pub fn track(args: &BenchTrackArgs, gpu: &GpuContext) -> Result<()> {
     print!("{}", summary::summary(&rows));
     println!(
         "\nwritten to {}: track.csv, track.json, track.txt, track.svg, energy.svg, views.svg",
-        args.output.out.display()
+        args.simulation.output.out.display()
     );
     Ok(())
 }

@@ -4,7 +4,7 @@ use std::{ops::Range, path::Path};
 
 use clap::Args;
 use flyrig_fusion::{BodySettings, BudgetSettings, Origin, PerceptionSettings, SessionSettings};
-use flyrig_report::arguments::{FpsArgs, parse_fps, parse_range, parse_size};
+use flyrig_report::arguments::{FpsArgs, OutputArgs, parse_fps, parse_range, parse_size};
 use flyrig_takes::ReplaySettings;
 
 /// Frames and cameras of recorded data sets.
@@ -43,9 +43,11 @@ impl RecordedArgs {
     }
 }
 
-/// A simulated person before a rig.
+/// A simulated person before a rig, and the folder of the results.
 #[derive(Debug, Args)]
 pub struct SimulationArgs {
+    #[command(flatten)]
+    pub output: OutputArgs,
     /// Seed of the first simulated person; further people have the following seeds.
     #[arg(long, default_value_t = 1)]
     pub seed: u64,

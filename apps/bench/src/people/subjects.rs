@@ -14,10 +14,7 @@ use flyrig_fusion::{
 };
 use flyrig_gpu::GpuContext;
 use flyrig_metrics::{ScoreSheet, score_view};
-use flyrig_report::{
-    arguments::{GaussiansArgs, OutputArgs},
-    png, progress_bar, write_whole,
-};
+use flyrig_report::{arguments::GaussiansArgs, png, progress_bar, write_whole};
 use flyrig_sim::{MotionConfig, MotionKind, RingConfig, SimConfig, Simulator};
 use flyrig_types::{Image, Mask, RenderedView, Rig};
 
@@ -42,8 +39,6 @@ pub struct BenchSubjectsArgs {
     /// Frames of the sequence; the second half is scored.
     #[arg(long, default_value_t = 12, value_parser = clap::value_parser!(u16).range(2..=1000).map(usize::from))]
     pub frames: usize,
-    #[command(flatten)]
-    pub output: OutputArgs,
     #[command(flatten)]
     pub simulation: SimulationArgs,
     #[command(flatten)]
@@ -103,7 +98,7 @@ impl Tracks {
 
 /// Runs the command.
 pub fn subjects(args: &BenchSubjectsArgs, gpu: &GpuContext) -> Result<()> {
-    args.output.create()?;
+    args.simulation.output.create()?;
     let mut people = (0..args.people).map(|who| simulator(gpu, args, who)).collect::<Result<Vec<_>>>()?;
     let rig = people[0].rig().clone();
     let bar = progress_bar((args.frames * (args.people + 1)) as u64, "bench subjects");
@@ -137,9 +132,9 @@ pub fn subjects(args: &BenchSubjectsArgs, gpu: &GpuContext) -> Result<()> {
         let one_ms = alone.iter().map(|row| row.set_ms).sum::<f64>() / alone.len() as f64;
         table += &format!("\nall take {:.2} times as long as one person\n", together.set_ms / one_ms);
     }
-    write_whole(&args.output.out.join("subjects.md"), table.as_bytes())?;
+    write_whole(&args.simulation.output.out.join("subjects.md"), table.as_bytes())?;
     print!("{table}");
-    println!("{}; subjects.md and views in {}", gpu.fastest().adapter_name(), args.output.out.display());
+    println!("{}; subjects.md and views in {}", gpu.fastest().adapter_name(), args.simulation.output.out.display());
     Ok(())
 }
 
@@ -248,15 +243,15 @@ fn run(
                 }
                 if index as usize + 1 == args.frames {
                     let file = format!("{}-{}", name.replace(' ', "-"), camera.id);
-                    png::write_view(&args.output.out.join(format!("{file}.png")), &view)?;
+                    png::write_view(&args.simulation.output.out.join(format!("{file}.png")), &view)?;
                     let truth = png::encode_rgb(image.bytes(), image.width(), image.height())?;
-                    write_whole(&args.output.out.join(format!("{file}-truth.png")), &truth)?;
+                    write_whole(&args.simulation.output.out.join(format!("{file}-truth.png")), &truth)?;
                 }
             }
         }
         bar.inc(1);
     }
-    write_subjects(&args.output.out, &name, &session)?;
+    write_subjects(&args.simulation.output.out, &name, &session)?;
     let mean = sheet.mean().context("nothing to compare")?;
     Ok(Row {
         name,

@@ -10,7 +10,7 @@ use flyrig_fusion::{
 };
 use flyrig_gpu::GpuContext;
 use flyrig_report::{
-    arguments::{FpsArgs, OutputArgs, parse_seconds},
+    arguments::{FpsArgs, parse_seconds},
     progress_bar, write_whole,
 };
 use flyrig_sim::{MotionConfig, MotionKind, RingConfig, SceneConfig, SimConfig, Simulator};
@@ -41,8 +41,6 @@ pub struct BenchTakesArgs {
     /// Seconds that the last person is absent, from 3 s after the start on; no person leaves otherwise.
     #[arg(long, value_parser = parse_seconds)]
     pub away_secs: Option<f64>,
-    #[command(flatten)]
-    pub output: OutputArgs,
     #[command(flatten)]
     pub simulation: SimulationArgs,
     #[command(flatten)]
@@ -79,7 +77,7 @@ struct Take {
 
 /// Runs the command.
 pub fn takes(args: &BenchTakesArgs, gpu: &GpuContext) -> Result<()> {
-    args.output.create()?;
+    args.simulation.output.create()?;
     let sets = (args.secs * args.rate.fps).round().max(1.0) as u64;
     let bar = progress_bar(args.takes * sets, "bench takes");
     let mut table = String::from(
@@ -91,13 +89,18 @@ pub fn takes(args: &BenchTakesArgs, gpu: &GpuContext) -> Result<()> {
         let take = run(args, gpu, args.simulation.seed + index * args.people as u64, sets, &bar)?;
         table += &row(&(args.simulation.seed + index * args.people as u64).to_string(), &take);
         total.add(take);
-        write_whole(&args.output.out.join("takes.md"), table.as_bytes())?;
+        write_whole(&args.simulation.output.out.join("takes.md"), table.as_bytes())?;
     }
     bar.finish_and_clear();
     table += &row("all", &total);
-    write_whole(&args.output.out.join("takes.md"), table.as_bytes())?;
+    write_whole(&args.simulation.output.out.join("takes.md"), table.as_bytes())?;
     print!("{table}");
-    println!("{} people; {}; takes.md in {}", args.people, gpu.fastest().adapter_name(), args.output.out.display());
+    println!(
+        "{} people; {}; takes.md in {}",
+        args.people,
+        gpu.fastest().adapter_name(),
+        args.simulation.output.out.display()
+    );
     Ok(())
 }
 

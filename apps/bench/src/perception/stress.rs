@@ -13,10 +13,7 @@ use flyrig_fusion::{
 };
 use flyrig_gpu::GpuContext;
 use flyrig_metrics::mask_iou;
-use flyrig_report::{
-    arguments::{FpsArgs, OutputArgs},
-    paint_outline, png, progress_bar, write_whole,
-};
+use flyrig_report::{arguments::FpsArgs, paint_outline, png, progress_bar, write_whole};
 use flyrig_sim::{
     Build, LightConfig, LightSwitch, MotionConfig, MotionKind, PersonConfig, RingConfig, SceneConfig, SceneKind,
     SimConfig, Simulator,
@@ -41,8 +38,6 @@ pub struct BenchStressArgs {
     /// Number of cameras on a ring of 3 m radius.
     #[arg(long, default_value_t = 3, value_parser = clap::value_parser!(u8).range(1..=16).map(usize::from))]
     pub cameras: usize,
-    #[command(flatten)]
-    pub output: OutputArgs,
     #[command(flatten)]
     pub simulation: SimulationArgs,
     #[command(flatten)]
@@ -137,7 +132,7 @@ struct Row {
 
 /// Runs the command.
 pub fn stress(args: &BenchStressArgs, gpu: &GpuContext) -> Result<()> {
-    args.output.create()?;
+    args.simulation.output.create()?;
     let mut table = String::from(
         "| disturbance | joints mm (95 %) before | during | after | mask IoU before | during | after | not found before | during | \
          after | recovery s | ms per frame set |\n|---|---|---|---|---|---|---|---|---|---|---|---|\n",
@@ -150,10 +145,10 @@ pub fn stress(args: &BenchStressArgs, gpu: &GpuContext) -> Result<()> {
         let line = format_row(&row);
         eprint!("{line}");
         table += &line;
-        write_whole(&args.output.out.join("stress.md"), table.as_bytes())?;
+        write_whole(&args.simulation.output.out.join("stress.md"), table.as_bytes())?;
     }
     print!("{table}");
-    println!("stress.md and images in {}", args.output.out.display());
+    println!("stress.md and images in {}", args.simulation.output.out.display());
     Ok(())
 }
 
@@ -401,7 +396,7 @@ fn run(args: &BenchStressArgs, gpu: &GpuContext, case: &Case, index: usize) -> R
     }
     bar.finish_and_clear();
     let name = format!("{index:02}-{}.png", case.name.replace([' ', '.'], "-"));
-    write_sheet(&args.output.out.join(name), &sheet.into_values().collect::<Vec<_>>())?;
+    write_sheet(&args.simulation.output.out.join(name), &sheet.into_values().collect::<Vec<_>>())?;
     Ok(tally.into_row(case.name, 1e3 * seconds / total.max(1) as f64))
 }
 

@@ -5,7 +5,6 @@ use std::path::PathBuf;
 use clap::{Args, builder::TypedValueParser as _};
 use flyrig_body::DEFAULT_GAUSSIAN_COUNT;
 use flyrig_fusion::Origin;
-use flyrig_report::arguments::OutputArgs;
 
 use super::subject::CodedSubject;
 use crate::harness::arguments::{RecordedArgs, SimulationArgs};
@@ -35,8 +34,6 @@ pub struct BenchStreamArgs {
     /// Avatar of the person (`flyrig avatar build`): tracking starts from it, and an encoding sends it once and then poses alone.
     #[arg(long, value_name = "FILE")]
     pub avatar: Option<PathBuf>,
-    #[command(flatten)]
-    pub output: OutputArgs,
     #[command(flatten)]
     pub simulation: SimulationArgs,
 }

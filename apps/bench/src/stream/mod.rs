@@ -24,7 +24,7 @@ use take::CodedTake;
 
 /// Runs the command.
 pub fn stream(args: &BenchStreamArgs, gpu: &GpuContext) -> Result<()> {
-    args.output.create()?;
+    args.simulation.output.create()?;
     let has_codec = atlas::has_codec();
     if !has_codec {
         eprintln!("the program ffmpeg was not found: no colours are coded as a video");
@@ -43,16 +43,20 @@ pub fn stream(args: &BenchStreamArgs, gpu: &GpuContext) -> Result<()> {
         }
     }
     print!("{}{}", table::table(&rows), table::exponents(&rows));
-    println!("{}; stream.md, .csv, .json and .svg in {}", gpu.fastest().adapter_name(), args.output.out.display());
+    println!(
+        "{}; stream.md, .csv, .json and .svg in {}",
+        gpu.fastest().adapter_name(),
+        args.simulation.output.out.display()
+    );
     Ok(())
 }
 
 fn write(args: &BenchStreamArgs, rows: &[FormRow]) -> Result<()> {
     let text = table::table(rows) + &table::exponents(rows);
-    write_whole(&args.output.out.join("stream.md"), text.as_bytes())?;
-    write_whole(&args.output.out.join("stream.csv"), table::csv(rows).as_bytes())?;
-    write_whole(&args.output.out.join("stream.json"), &serde_json::to_vec_pretty(rows)?)?;
-    write_whole(&args.output.out.join("stream.svg"), table::plot(rows).svg().as_bytes())?;
+    write_whole(&args.simulation.output.out.join("stream.md"), text.as_bytes())?;
+    write_whole(&args.simulation.output.out.join("stream.csv"), table::csv(rows).as_bytes())?;
+    write_whole(&args.simulation.output.out.join("stream.json"), &serde_json::to_vec_pretty(rows)?)?;
+    write_whole(&args.simulation.output.out.join("stream.svg"), table::plot(rows).svg().as_bytes())?;
     Ok(())
 }
 

@@ -39,8 +39,12 @@ pub fn folders(args: &BenchStreamArgs, gpu: &GpuContext) -> Result<Vec<(String, 
             }
             CodedSubject::Simulated(kind, motion) => {
                 let frames = args.replay.frames.as_ref().map_or(SIMULATED_FRAMES, |frames| frames.end);
-                let folder =
-                    args.output.out.join("takes").join(format!("{motion}-{seed}-{}-{frames}", args.simulation.side));
+                let folder = args
+                    .simulation
+                    .output
+                    .out
+                    .join("takes")
+                    .join(format!("{motion}-{seed}-{}-{frames}", args.simulation.side));
                 simulate(gpu, &folder, *kind, seed, args.simulation.side, frames)?;
                 seed += 1;
                 (format!("{SIMULATED}{motion}"), folder)

@@ -10,16 +10,13 @@ use flyrig_fusion::{
 };
 use flyrig_gpu::GpuContext;
 use flyrig_report::{stop, write_whole};
-use flyrig_takes::{Calibration, Take, TakeOptions, TakeSpan};
+use flyrig_takes::{Calibration, Take, TakeSpan};
 use flyrig_types::{CameraId, ColorMatch, FrameSet, Rig};
 use glam::DVec2;
 use serde_json::json;
 
 use super::output::{FILES, refuse_existing};
-use crate::{
-    arguments::{CalibrationArgs, InputArgs, SpanArgs, TargetArgs},
-    opening::open_take,
-};
+use crate::arguments::{CalibratedInputArgs, TargetArgs};
 
 /// Arguments of `flyrig calibrate color`.
 #[derive(Debug, Args)]
@@ -29,11 +26,7 @@ pub struct CalibrateColorArgs {
     #[arg(long, default_value_t = 1)]
     pub people: usize,
     #[command(flatten)]
-    pub source: InputArgs,
-    #[command(flatten)]
-    pub calibration: CalibrationArgs,
-    #[command(flatten)]
-    pub span: SpanArgs,
+    pub input: CalibratedInputArgs,
     #[command(flatten)]
     pub target: TargetArgs,
 }
@@ -60,9 +53,7 @@ const MOST_HALVES: f64 = 0.03;
 pub fn color(args: &CalibrateColorArgs, gpu: &dyn Fn() -> Result<GpuContext>) -> Result<()> {
     stop::flag();
     refuse_existing(&args.target.out, &FILES, args.target.force)?;
-    let calibration = args.calibration.calibration.as_deref();
-    let options = TakeOptions { fps: args.source.rate.fps, calibration, ..TakeOptions::default() };
-    let open = || open_take(&args.source.input, &options, gpu);
+    let open = || args.input.open(gpu);
     let mut take = open()?;
     ensure!(
         !take.is_live,
@@ -111,7 +102,7 @@ pub fn color(args: &CalibrateColorArgs, gpu: &dyn Fn() -> Result<GpuContext>) ->
 
 /// Reads frame sets of the first seconds, from which shapes are estimated.
 fn first_sets(args: &CalibrateColorArgs, rig: &Rig, take: Take) -> Result<Vec<FrameSet>> {
-    let secs = [args.span.from_secs, args.span.from_secs + SHAPE_SECS];
+    let secs = [args.input.span.from_secs, args.input.span.from_secs + SHAPE_SECS];
     let (mut sets, mut first): (Vec<FrameSet>, _) = (Vec::new(), None);
     take.for_each_set(rig, TakeSpan { secs, spread_nanos: 0 }, "the person's shape, ms of the take", |set| {
         let from = *first.get_or_insert(set.master_nanos);
@@ -126,7 +117,7 @@ fn first_sets(args: &CalibrateColorArgs, rig: &Rig, take: Take) -> Result<Vec<Fr
 
 /// Tracks people through the take and samples the colours of their surfaces.
 fn sample_colors(args: &CalibrateColorArgs, rig: &Rig, session: &mut Session, take: Take) -> Result<Vec<ColorPoint>> {
-    let secs = [args.span.from_secs, args.span.from_secs + args.span.secs];
+    let secs = [args.input.span.from_secs, args.input.span.from_secs + args.input.span.secs];
     let (mut points, mut sets) = (Vec::new(), 0u64);
     let errors = take.for_each_set(rig, TakeSpan { secs, spread_nanos: 0 }, "colours, ms of the take", |set| {
         session.process(set)?;

@@ -24,7 +24,7 @@ use super::{
     rig::{self, PAGE, RigTarget},
     views::{BoardTakeArgs, SeenBoards, open_frames},
 };
-use crate::arguments::{BoardArgs, SolveArgs, TargetArgs};
+use crate::arguments::{SolveArgs, TargetArgs};
 
 /// Arguments of `flyrig calibrate live`.
 #[derive(Debug, Args)]
@@ -38,8 +38,6 @@ pub struct CalibrateLiveArgs {
     pub listen: String,
     #[command(flatten)]
     pub take: BoardTakeArgs,
-    #[command(flatten)]
-    pub board: BoardArgs,
     #[command(flatten)]
     pub solve: SolveArgs,
     #[command(flatten)]
@@ -64,7 +62,7 @@ const NEW_BOARDS: usize = 4;
 /// Runs the command.
 pub fn live(args: &CalibrateLiveArgs, gpu: &dyn Fn() -> Result<GpuContext>) -> Result<()> {
     stop::flag();
-    let board = Board::load(&args.board.board)?;
+    let board = Board::load(&args.solve.board.board)?;
     refuse_existing(&args.target.out, &[&FILES[..], &[PAGE]].concat(), args.target.force)?;
     let opened = open_frames(&args.take, gpu)?;
     let ids: Vec<CameraId> = opened.sources.iter().map(|source| source.camera().clone()).collect();

@@ -9,17 +9,14 @@ use flyrig_calib::{
 use flyrig_gpu::GpuContext;
 use flyrig_report::{stop, write_whole};
 use flyrig_sync::{HullCorner, silhouette_hull};
-use flyrig_takes::{Calibration, Take, TakeOptions, TakeSpan};
+use flyrig_takes::{Calibration, Take, TakeSpan};
 use flyrig_tracker::{PoseConfig, PoseNet, Viewers};
 use flyrig_types::{Camera, Image, Rig};
 use glam::DVec2;
 use serde_json::json;
 
 use super::output::{FILES, refuse_existing};
-use crate::{
-    arguments::{CalibrationArgs, InputArgs, SpanArgs, TargetArgs},
-    opening::open_take,
-};
+use crate::arguments::{CalibratedInputArgs, TargetArgs};
 
 /// Arguments of `flyrig calibrate person`.
 #[derive(Debug, Args)]
@@ -28,11 +25,7 @@ pub struct CalibratePersonArgs {
     #[arg(long)]
     pub no_offsets: bool,
     #[command(flatten)]
-    pub source: InputArgs,
-    #[command(flatten)]
-    pub calibration: CalibrationArgs,
-    #[command(flatten)]
-    pub span: SpanArgs,
+    pub input: CalibratedInputArgs,
     #[command(flatten)]
     pub target: TargetArgs,
 }
@@ -79,9 +72,7 @@ const CONFIDENCE: f64 = 0.3;
 pub fn person(args: &CalibratePersonArgs, gpu: &dyn Fn() -> Result<GpuContext>) -> Result<()> {
     stop::flag();
     refuse_existing(&args.target.out, &FILES, args.target.force)?;
-    let calibration = args.calibration.calibration.as_deref();
-    let options = TakeOptions { fps: args.source.rate.fps, calibration, ..TakeOptions::default() };
-    let mut take = open_take(&args.source.input, &options, gpu)?;
+    let mut take = args.input.open(gpu)?;
     ensure!(
         !take.is_live,
         "live cameras cannot be processed frame by frame; record them first (flyrig record) and give the recording"
@@ -145,7 +136,7 @@ fn track_landmarks(
     let template = default_template(&ShapeParams::default())?;
     let mut viewers = Viewers::new(&PoseNet::embedded()?, &template, rig, plates, &PoseConfig::default())?;
     let mut tracks = PersonTracks::new(rig.cameras.len(), LANDMARKS.len());
-    let secs = [args.span.from_secs, args.span.from_secs + args.span.secs];
+    let secs = [args.input.span.from_secs, args.input.span.from_secs + args.input.span.secs];
     let errors = take.for_each_set(rig, TakeSpan { secs, spread_nanos: 0 }, "the person, ms of the take", |set| {
         for (slot, found) in viewers.estimate(set)?.into_iter().enumerate() {
             let (Some(found), Some(frame)) = (found, &set.frames[slot]) else { continue };

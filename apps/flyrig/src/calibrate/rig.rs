@@ -17,7 +17,7 @@ use super::{
     page,
     views::{BoardTakeArgs, SeenBoards},
 };
-use crate::arguments::{BoardArgs, SolveArgs, TargetArgs};
+use crate::arguments::{SolveArgs, TargetArgs};
 
 /// Arguments of `flyrig calibrate rig`.
 #[derive(Debug, Args)]
@@ -27,8 +27,6 @@ pub struct CalibrateRigArgs {
     /// Optimize the lenses together with the poses.
     #[arg(long)]
     pub refine_lenses: bool,
-    #[command(flatten)]
-    pub board: BoardArgs,
     #[command(flatten)]
     pub solve: SolveArgs,
     #[command(flatten)]
@@ -59,7 +57,7 @@ pub(super) struct RigTarget<'a> {
 /// Runs the command.
 pub fn rig(args: &CalibrateRigArgs, gpu: &dyn Fn() -> Result<GpuContext>) -> Result<()> {
     stop::flag();
-    let board = Board::load(&args.board.board)?;
+    let board = Board::load(&args.solve.board.board)?;
     refuse_existing(&args.target.out, &[&FILES[..], &[PAGE]].concat(), args.target.force)?;
     let seen = SeenBoards::find(&args.take, &board, gpu)?;
     ensure!(seen.ids.len() > 1, "one camera alone is no rig; flyrig calibrate lens calibrates it");
