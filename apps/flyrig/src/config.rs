@@ -175,7 +175,7 @@ impl Config {
     fn parse_values(text: &str) -> Result<Self> {
         let config: Self = toml::from_str(text).map_err(|error| match removed_key(text, &error) {
             Some(advice) => anyhow!(advice),
-            None => explain(&error, &toml::Table::try_from(Self::default()).unwrap_or_default()),
+            None => explain::<Self>(text, &error, &toml::Table::try_from(Self::default()).unwrap_or_default()),
         })?;
         config.check_values()?;
         Ok(config)
@@ -332,8 +332,10 @@ mod tests {
         assert!(error.contains("unknown field `max_wait`"), "{error}");
         assert!(error.ends_with("did you mean `max_wait_ms`?"), "{error}");
         let error = Config::parse("[perception]\nfloor = 1.0\n").unwrap_err().to_string();
-        assert!(error.contains("unknown field `floor`"), "{error}");
+        assert!(error.starts_with("line 2: perception.floor: unknown field `floor`"), "{error}");
         assert!(error.ends_with("did you mean `floor_m`?"), "{error}");
+        let error = Config::parse("[rig]\n[perception]\npeople = 1\nfloor_m = true\n").unwrap_err().to_string();
+        assert!(error.starts_with("line 4: perception.floor_m: invalid type: boolean `true`, expected f64"), "{error}");
         let error = Config::parse("[apearance]\n").unwrap_err().to_string();
         assert!(error.ends_with("did you mean `appearance`?"), "{error}");
     }

@@ -26,7 +26,8 @@ pub fn load(path: &Path) -> Result<SimConfig> {
 /// # Errors
 /// Names the key, its value and what is expected.
 pub fn parse(text: &str) -> Result<SimConfig> {
-    let config: SimConfig = toml::from_str(text).map_err(|error| toml_errors::explain(&error, &toml::Table::new()))?;
+    let config: SimConfig =
+        toml::from_str(text).map_err(|error| toml_errors::explain::<SimConfig>(text, &error, &toml::Table::new()))?;
     config.validate()?;
     Ok(config)
 }

@@ -1,11 +1,42 @@
-//! Errors of TOML files, with the key that was probably meant.
+//! Errors of TOML files, with the key that is wrong and the one that was probably meant.
 
 use anyhow::anyhow;
+use serde::de::DeserializeOwned;
 
-/// Adds the known key that is nearest to an unknown one. `all` holds every table with its default keys.
-pub fn explain(error: &toml::de::Error, all: &toml::Table) -> anyhow::Error {
+/// Explains why `text` is no `T`: names the line and the key, and the known key nearest to an unknown one. `all` holds every table with
+/// its default keys.
+///
+/// Tables with flattened settings of another crate (`serde(flatten)`) report the line of their header alone; the key is found by reading
+/// the table's keys one at a time.
+pub fn explain<T: DeserializeOwned>(text: &str, error: &toml::de::Error, all: &toml::Table) -> anyhow::Error {
+    let found = error.span().and_then(|span| key_of_table::<T>(text, span.start, all));
+    let (place, error) = match &found {
+        Some((place, error)) => (place.as_str(), error),
+        None => ("", error),
+    };
     let hint = nearest_key(error.message(), all).map(|key| format!("did you mean `{key}`?")).unwrap_or_default();
-    anyhow!("{}{hint}", error.to_string().trim_end_matches(' '))
+    match place {
+        "" => anyhow!("{}{hint}", error.to_string().trim_end_matches(' ')),
+        place => anyhow!("{place}: {}\n{hint}", error.message()),
+    }
+}
+
+/// Returns the line and name of the key that makes the table whose header is at `start` invalid, and its error.
+fn key_of_table<T: DeserializeOwned>(text: &str, start: usize, all: &toml::Table) -> Option<(String, toml::de::Error)> {
+    let header = text.get(start..)?.lines().next()?;
+    let name = header.trim().strip_prefix('[')?.strip_suffix(']').filter(|name| all.contains_key(*name))?;
+    let tables: toml::Table = text.parse().ok()?;
+    let line_of = |key: &str| {
+        let is_key = |line: &str| line.split_once('=').is_some_and(|(before, _)| before.trim() == key);
+        let at = text[start..].lines().position(is_key)?;
+        Some(text[..start].matches('\n').count() + at + 1)
+    };
+    tables.get(name)?.as_table()?.iter().find_map(|(key, value)| {
+        let alone = toml::Table::from_iter([(key.clone(), value.clone())]);
+        let alone = toml::Table::from_iter([(name.to_owned(), toml::Value::Table(alone))]);
+        let error = toml::from_str::<T>(&alone.to_string()).err()?;
+        Some((format!("line {}: {name}.{key}", line_of(key)?), error))
+    })
 }
 
 /// Finds the key most similar to `x` in a message "unknown field `x`, expected one of `a`, `b`": among the listed keys, else in `all`.
