@@ -239,7 +239,7 @@ fn damaged_files_are_named_with_the_fix() {
     check(
         Format::Colmap,
         &[("cameras.txt", lens), ("images.txt", "1 1 0 0 0 0 0 0 1 a/0.png\n\n2 1 0 0 0 0 0 1 1 a/1.png\n\n")],
-        "camera a stands in two places",
+        "camera a has two poses",
     );
     check(Format::Colmap, &[("cameras.bin", "")], "model_converter --output_type TXT");
     check(Format::Colmap, &[("cameras.txt", lens)], "images.txt: cannot be read");
