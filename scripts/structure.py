@@ -25,7 +25,7 @@ def is_test(path):
 
 def production(path):
     """Source without its inline test module, comments kept."""
-    return re.split(r"\n#\[cfg\(test\)\]\nmod \w+ \{", text[path])[0]
+    return re.split(r"\n#\[cfg\(test\)\]\n(?:#\[[^\n]*\]\n)*(?:pub\(crate\) )?mod \w+ \{", text[path])[0]
 
 
 def blank(code):
@@ -108,8 +108,8 @@ def cycles():
         for module, path in files.items():
             code = re.sub(r"\bpub(?:\([^)]*\))? use [^;]*;", "", blank(production(path)))
             parent = module.rsplit("/", 1)[0] if "/" in module else ""
-            for use in re.findall(r"\b(?:use\s+)?((?:crate|super|self)(?:::(?:\w+|\{[^;]*?\}))+)", code):
-                for target in expand(use):
+            for start in re.finditer(r"(?<!::)\b(?:crate|super|self)::", code):
+                for target in expand(use_at(code, start.start())):
                     steps = target.split("::")
                     base = []
                     if steps[0] == "super":
@@ -137,6 +137,20 @@ def cycles():
             if len(group) > 1:
                 groups.append(" ".join(sorted(files[m] for m in group)))
     return groups
+
+
+def use_at(code, start):
+    """Returns the path that begins at `start`, with its nested braces."""
+    depth = 0
+    for end in range(start, len(code)):
+        letter = code[end]
+        depth += {"{": 1, "}": -1}.get(letter, 0)
+        ends = letter == "}" and depth == 0 or depth < 0
+        if ends or depth == 0 and not (letter.isalnum() or letter in "_:{"):
+            return code[start : end + ends * (depth == 0)]
+        if letter == "{" and code[end - 2 : end] != "::":
+            return code[start:end]
+    return code[start:]
 
 
 def expand(use):

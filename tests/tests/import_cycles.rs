@@ -33,10 +33,20 @@ fn modules(src: &Path) -> BTreeMap<Vec<String>, PathBuf> {
     found
 }
 
+/// Returns where the inline test module of a source starts; its length without one.
+fn inline_tests(text: &str) -> usize {
+    let is_module = |at: usize| {
+        let mut lines = text[at..].lines().skip(2).skip_while(|line| line.starts_with("#["));
+        lines.next().is_some_and(|line| line.contains("mod ") && line.ends_with('{'))
+    };
+    let mut starts = text.match_indices("\n#[cfg(test)]\n").map(|(at, _)| at);
+    starts.find(|at| is_module(*at)).unwrap_or(text.len())
+}
+
 /// Returns the source without line comments, inline tests and re-exports.
 fn code(path: &Path) -> String {
     let text = std::fs::read_to_string(path).unwrap();
-    let production = text.split("\n#[cfg(test)]\nmod tests {").next().unwrap_or_default().to_owned();
+    let production = &text[..inline_tests(&text)];
     let lines = production.lines().map(|line| line.split("//").next().unwrap_or_default());
     let mut code = lines.collect::<Vec<_>>().join("\n");
     for start in ["pub use ", "pub(crate) use ", "pub(super) use "] {
@@ -72,6 +82,10 @@ fn expand(text: &mut std::iter::Peekable<std::str::Chars<'_>>, mut head: Vec<Str
         let mut name = String::new();
         while let Some(letter) = text.next_if(|letter| letter.is_alphanumeric() || *letter == '_') {
             name.push(letter);
+        }
+        // Behind a trailing comma.
+        if name.is_empty() {
+            return;
         }
         head.push(name);
         let mut rest = text.clone();
@@ -162,9 +176,9 @@ fn a_cycle_is_found() {
     let name = |text: &str| text.split("::").map(str::to_owned).collect::<Vec<_>>();
     let all: BTreeMap<_, _> = ["a", "b", "a::c"].map(|module| (name(module), PathBuf::new())).into();
     let sources = [
-        ("a", "use crate::{b::{One, Two}, d::Three};"),
+        ("a", "use crate::{\n    b::{One, Two},\n    d::Three,\n};"),
         ("b", "fn f() { crate::a::c::g() }"),
-        ("a::c", "use super::Four;"),
+        ("a::c", "use super::{\n    Four,\n};"),
     ];
     let edges: BTreeMap<_, _> = sources.map(|(module, code)| (name(module), imports(&name(module), code, &all))).into();
     assert_eq!(edges[&name("b")], BTreeSet::from([name("a::c")]));

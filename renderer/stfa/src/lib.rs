@@ -29,6 +29,7 @@ mod structure;
 mod taps;
 mod tensor_file;
 mod train;
+mod train_settings;
 mod variation;
 mod weights;
 
@@ -42,5 +43,6 @@ pub use paint::{LearnedAppearance, PaintCounts};
 pub use parameters::{NetworkSize, Parameters};
 pub use sample::{PATCH, SHARES, TargetImage, TargetPixels, TrainingSample, training_sample};
 pub use taps::{FeatureMaps, Tap, Taps};
-pub use train::{Loss, TrainSettings, Trainer};
+pub use train::{Loss, Trainer};
+pub use train_settings::TrainSettings;
 pub use weights::{EMBEDDED, WEIGHTS_VERSION};

@@ -5,7 +5,7 @@ use rand::{RngExt as _, rngs::SmallRng, seq::SliceRandom as _};
 use crate::{
     inputs::{CANDIDATES, STATE},
     taps::Taps,
-    train::TrainSettings,
+    train_settings::TrainSettings,
 };
 
 /// Augmentation of one step.
