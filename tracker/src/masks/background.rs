@@ -47,7 +47,7 @@ use crate::masks::plate::Plate;
 /// let wall = |x: usize, y: usize| [120 + (x / 4) as u8, 130 + (y / 5) as u8, 110];
 /// let shirt = |x: usize, y: usize| if (70..90).contains(&x) && (50..110).contains(&y) { [30, 40, 160] } else { wall(x, y) };
 /// let image = |paint: &dyn Fn(usize, usize) -> [u8; 3]| {
-///     let bytes = (0..160 * 160).flat_map(|at| paint(at % 160, at / 160)).collect();
+///     let bytes: Vec<u8> = (0..160 * 160).flat_map(|at| paint(at % 160, at / 160)).collect();
 ///     Image::new(160, 160, PixelFormat::Rgb8, bytes)
 /// };
 /// let background = Background::from_plate(&camera, &image(&wall)?)?;

@@ -54,7 +54,7 @@ const LOOKS_EMPTY: f32 = 0.4;
 /// // A dark square before a light wall, and a mask that is two pixels too wide.
 /// let dark = |at: usize| (20..44).contains(&(at % 64)) && (20..44).contains(&(at / 64));
 /// let wide = |at: usize| (18..46).contains(&(at % 64)) && (18..46).contains(&(at / 64));
-/// let bytes = (0..64 * 64).flat_map(|at| if dark(at) { [20, 30, 60] } else { [200, 190, 170] }).collect();
+/// let bytes: Vec<u8> = (0..64 * 64).flat_map(|at| if dark(at) { [20, 30, 60] } else { [200, 190, 170] }).collect();
 /// let image = Image::new(64, 64, PixelFormat::Rgb8, bytes)?;
 /// let mask = Mask::new(64, 64, (0..64 * 64).map(|at| 255 * u8::from(wide(at))).collect())?;
 ///

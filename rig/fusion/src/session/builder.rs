@@ -26,12 +26,12 @@ use crate::{
 /// # fn rig() -> flyrig_fusion::types::Rig { unimplemented!() }
 ///
 /// let (rig, settings) = (rig(), SessionSettings::default());
-/// let plates = vec![None; rig.cameras.len()];
+/// let plates: Vec<_> = rig.cameras.iter().map(|_| None).collect();
 /// let body = default_template(&ShapeParams::default())?;
 /// let perception = EstimatedPerception::new(&rig, &body, &settings.perception, &plates)?;
 /// let gpu = GpuContext::new(&AdapterChoice::Best)?;
 /// let session = SessionBuilder::new(gpu, rig).settings(settings).perception(perception).build()?;
-/// assert!(!session.has_people(), "nobody was seen yet");
+/// assert!(!session.has_people(), "no person was seen yet");
 /// # Ok::<(), Box<dyn std::error::Error>>(())
 /// ```
 pub struct SessionBuilder {

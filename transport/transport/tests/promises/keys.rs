@@ -265,7 +265,7 @@ fn cameras_of_another_computer_need_a_key_alone_and_read_nothing() {
     }
     assert_eq!((all.load(Ordering::Relaxed), images.load(Ordering::Relaxed)), (0, 0));
     ring.revoke("cams").unwrap();
-    wait_until("the word that it is gone", || there.absence(&"a".into()).contains("gone from the network"));
+    wait_until("the word that it is gone", || there.absence(&"a".into()).contains("has left the network"));
     let trouble = wait_for("the reason", || here.trouble());
     assert!(trouble.contains("it was revoked"), "{trouble}");
 }
