@@ -35,6 +35,7 @@ pub struct ReplayArgs {
 
 /// Runs the command.
 pub fn replay(args: &ReplayArgs) -> Result<()> {
+    stop::flag();
     let RecordedCameras { ids, rig } = recorded_cameras(&args.recording)?;
     for camera in args.lags.cameras() {
         let known: Vec<&str> = ids.iter().map(CameraId::as_str).collect();
@@ -44,10 +45,13 @@ pub fn replay(args: &ReplayArgs) -> Result<()> {
     let settings = SyncSettings { lags_nanos: args.lags.nanos(), ..SyncSettings::default() };
     let settings = settings.with_offsets_of(rig.as_ref().map_or(&[], |rig| rig.cameras.as_slice()));
     let mut sync = Synchronizer::new(&ids, &settings);
+    let threads_config = ThreadsConfig { queue_capacity: 4 * ids.len().max(1), pacing: Pacing::Lossless };
+    let footage = Footage::Recording(args.recording.clone());
+    let threads = CaptureThreads::start(footage.open(Some(&ids), &FolderOptions::default())?.sources, threads_config)?;
     if let Some(folder) = &args.export {
         start_export(folder, &ids, rig.as_ref())?;
     }
-    let (tallies, digest) = play(&args.recording, &ids, &mut sync, args.export.as_deref())?;
+    let (tallies, digest) = play(&threads, &ids, &mut sync, args.export.as_deref())?;
     for (id, tally) in ids.iter().zip(&tallies) {
         println!("camera {id}: {}", tally.line());
     }
@@ -63,13 +67,14 @@ pub fn replay(args: &ReplayArgs) -> Result<()> {
     Ok(())
 }
 
-/// Reads all frames of a recording, and exports the frame sets to a folder, if any.
-fn play(path: &Path, ids: &[CameraId], sync: &mut Synchronizer, folder: Option<&Path>) -> Result<(Vec<Tally>, Digest)> {
+/// Reads all frames, and exports the frame sets to a folder, if any.
+fn play(
+    threads: &CaptureThreads,
+    ids: &[CameraId],
+    sync: &mut Synchronizer,
+    folder: Option<&Path>,
+) -> Result<(Vec<Tally>, Digest)> {
     let stop = stop::flag();
-    let threads_config = ThreadsConfig { queue_capacity: 4 * ids.len().max(1), pacing: Pacing::Lossless };
-    let footage = Footage::Recording(path.to_owned());
-    let sources = footage.open(Some(ids), &FolderOptions::default())?.sources;
-    let threads = CaptureThreads::start(sources, threads_config)?;
     let mut tallies = vec![Tally::default(); ids.len()];
     let mut digest = Digest::default();
     let export = |sets: Vec<FrameSet>| -> Result<()> {

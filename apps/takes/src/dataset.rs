@@ -71,12 +71,13 @@ pub fn load_rig(root: &Path, chosen: &[CameraId]) -> Result<Rig> {
     load_rig_of(root, root, chosen)
 }
 
-/// Loads a calibration for images in another folder; sizes that it lacks are those of the images in either folder.
+/// Loads a calibration for images in another folder. Its sizes are checked against these images, or else against images beside the
+/// calibration.
 ///
 /// # Errors
 /// See [`load_rig`].
 pub(crate) fn load_rig_of(calibration: &Path, images: &Path, chosen: &[CameraId]) -> Result<Rig> {
-    let size = |id: &CameraId| image_size(calibration, id).or_else(|| image_size(images, id));
+    let size = |id: &CameraId| image_size(images, id).or_else(|| image_size(calibration, id));
     load_calibration(calibration, &size).or_else(|error| {
         if matches!(error, CalibError::UnknownSize { .. }) {
             for camera in chosen.iter().filter(|id| !video_file(images, id).exists()) {

@@ -8,7 +8,6 @@ use flyrig_gpu::GpuContext;
 
 use crate::{
     configured::TakeConfig,
-    dataset,
     footage::{Footage, has_ending},
     recorded::recorded_cameras,
     take::{Calibration, Needs, Take, ready},
@@ -108,7 +107,9 @@ impl Take {
         options: &TakeOptions<'_>,
         folder_options: FolderOptions,
     ) -> Result<Self> {
-        let is_calibrated = dataset::has_calibration(root);
+        // Lenses without poses are no calibration of a rig: `sync-check` then compares motion.
+        let has = |file: &str| root.join(file).exists();
+        let is_calibrated = has("calibration.toml") || has("intri.yml") && has("extri.yml");
         let mut sources = footage.open(None, &folder_options)?.sources;
         let masks = root.join("mask");
         let given_masks = (is_calibrated || options.calibration.is_some())

@@ -30,7 +30,7 @@ use crate::harness::{
 
 /// Arguments of the command.
 #[derive(Debug, Args)]
-#[command(mut_arg("out", |arg| arg.default_value("out/bench-stress")), mut_arg("seed", |arg| arg.default_value("501")), mut_arg("side", |arg| arg.default_value("384")), mut_arg("fps", |arg| arg.default_value("10")))]
+#[command(mut_arg("out", |arg| arg.default_value("out/bench-stress")), mut_arg("seed", |arg| arg.default_value("501")), mut_arg("side", |arg| arg.default_value("384").value_parser(clap::value_parser!(u32).range(96..=2048))), mut_arg("fps", |arg| arg.default_value("10")))]
 pub struct BenchStressArgs {
     /// Run only cases whose names contain one of these texts, comma separated.
     #[arg(long, value_delimiter = ',')]
