@@ -164,7 +164,7 @@ impl Shown {
         let text = std::fs::read_to_string(&file).unwrap();
         // Six frames at a low rate: the rig must still run when the browser has drawn one.
         let source = format!("[source]\nkind = \"folder\"\npath = {take:?}\nfps = 0.2\n");
-        let text = text.replace("[source]\n", &source);
+        let text = text.replace("[source]\npath = \"sim.toml\"\n", &source);
         let body = format!("[body]\ntemplate = {:?}\navatar = \"a.flyavatar\"\n", format!("{take}/subject.glb"));
         let text = text.replace("[body]\n", &body).replace("[output]\n", "[output]\navatar = true\n");
         std::fs::write(&file, text).unwrap();
