@@ -183,7 +183,7 @@ fn images_that_show_nobody_and_frames_that_are_missing_are_refused() {
         Err(AvatarError::Images(text)) => text,
         other => panic!("{other:?}"),
     };
-    assert!(refused(Vec::new()).contains("nobody is in any image"));
+    assert!(refused(Vec::new()).contains("no person is in any image"));
     assert!(refused(vec![TrainingView::cut(3, &camera(0.0), &all).unwrap()]).contains("without a pose"));
     // A broken avatar stays where it is; the image that fills everything is cut to itself.
     let mut broken = ours.clone();

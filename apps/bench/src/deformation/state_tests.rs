@@ -124,7 +124,7 @@ fn the_tracking_degrades_and_comes_back_by_itself() {
         assert!(stage.quality() > goal - 0.03, "{name}");
     }
 
-    // Away for five seconds: somebody else may return, so all is forgotten.
+    // Away for five seconds: another person may return, so all is forgotten.
     let mut stage = Stage::new(&gpu, &sequence);
     stage.play(0..14, 0, as_is);
     stage.play(14..16, 0, nobody);

@@ -86,7 +86,7 @@ fn somebody_of_another_build_gets_another_shape_and_who_comes_back_keeps_it() {
     // Gone, and back: the same person.
     studio.show(&mut small, 7, true);
     assert_eq!(studio.show(&mut small, 16, false), Some(first), "who comes back keeps the shape");
-    // Gone, and somebody else comes.
+    // Gone, and another person comes.
     studio.show(&mut small, 7, true);
     let other = studio.show(&mut tall, 16, false).unwrap();
     assert_eq!(other.0, 1, "{first:?} {other:?}");
