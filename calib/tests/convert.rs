@@ -260,7 +260,7 @@ fn damaged_files_are_named_with_the_fix() {
         &[("a.cameramodel", "{ 'lensmodel': 'LENSMODEL_CAHVOR', 'intrinsics': [1,2,3,4] }")],
         "mrcal-convert-lensmodel",
     );
-    check(Format::Mrcal, &[("a.cameramodel", "import os")], "is no dictionary of Python");
+    check(Format::Mrcal, &[("a.cameramodel", "import os")], "is not a Python dictionary");
     check(Format::Qualisys, &[("a.qca.txt", "<a>")], "is no XML");
     check(Format::Qualisys, &[("a.qca.txt", "<a/>")], "names no camera");
     check(Format::Anipose, &[("anipose.toml", "[a]\nmatrix = 3\n")], "camera a: matrix is missing or not");
@@ -269,7 +269,7 @@ fn damaged_files_are_named_with_the_fix() {
     let good = "version = 1\nup = [0, 0, 1]\n[[cameras]]\nname = \"a\"\nsize = [640, 480]\nfocal_px = [500, 500]\ncenter_px = [320, 240]\n\
         lens = { model = \"fisheye\", coefficients = [0, 0, 0, 0] }\nrotation = [[1,0,0],[0,1,0],[0,0,1]]\ntranslation_m = [0, 0, 0]\n";
     for (from, to, expected) in [
-        ("up = [0, 0, 1]", "up = [0, 0, 0]", "up is no direction"),
+        ("up = [0, 0, 1]", "up = [0, 0, 0]", "up is not a direction"),
         ("size = [640, 480]", "size = [640]", "line 5: "),
         ("[500, 500]", "[-500, 500]", "camera a: focal length fx is -500"),
         ("[500, 500]", "[nan, 500]", "camera a: the camera matrix K is not a finite number"),
