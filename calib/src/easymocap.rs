@@ -13,6 +13,7 @@ use glam::{DMat3, DQuat, DVec2, DVec3};
 
 use crate::convert::shared::{opencv_coefficients, opencv_lens, rotation_of};
 use crate::error::CalibError;
+use crate::up::{level_up, nearest_axis};
 use crate::yaml::{Matrix, YamlFile, YamlWriter};
 
 const INTRINSICS: &str = "intri.yml";
@@ -20,7 +21,7 @@ const EXTRINSICS: &str = "extri.yml";
 
 /// Reads `intri.yml` and `extri.yml` of a folder. `image_size` gives width and height of a camera's images in pixels
 /// for files that lack them, and is checked against those that contain them. The world's axes stay as they are; the up
-/// direction is estimated from the cameras ([`Rig::guess_world_up`]).
+/// direction is the world axis that the cameras suggest.
 ///
 /// # Errors
 /// [`CalibError`] names the file, the camera and the fix.
@@ -45,7 +46,7 @@ pub fn load_easymocap(dir: &Path, image_size: &dyn Fn(&CameraId) -> Option<(u32,
             Ok(Camera { time_offset_nanos: 0, color: Default::default(), id, intrinsics, camera_from_world })
         })
         .collect::<Result<Vec<_>, CalibError>>()?;
-    let world_up = Rig::guess_world_up(&cameras);
+    let world_up = nearest_axis(level_up(&cameras));
     let rig = Rig { cameras, world_up };
     validate(&rig, dir)?;
     Ok(rig)

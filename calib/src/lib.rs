@@ -33,6 +33,7 @@ mod start;
 #[doc(hidden)]
 pub mod testing;
 mod uncertainty;
+mod up;
 mod watch;
 mod yaml;
 

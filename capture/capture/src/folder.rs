@@ -96,6 +96,11 @@ impl FolderReplay {
         self.shots.len() - self.next
     }
 
+    /// Leaves out the next frame.
+    pub fn skip(&mut self) {
+        self.next = (self.next + 1).min(self.shots.len());
+    }
+
     fn read(&self, shot: &FolderFrame) -> Result<Frame, CaptureError> {
         let file = |files: &BTreeMap<String, PathBuf>, what: &str| {
             shot.stems.iter().find_map(|stem| files.get(stem)).cloned().ok_or_else(|| {
