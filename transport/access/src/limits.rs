@@ -33,7 +33,8 @@ pub(crate) struct Limits {
     pending: usize,
 }
 
-fn network(address: IpAddr) -> IpAddr {
+/// Returns the network that counts as one client: an IPv4 address, or 64 bits of an IPv6 address.
+pub(crate) fn network(address: IpAddr) -> IpAddr {
     match address {
         IpAddr::V4(_) => address,
         IpAddr::V6(v6) => v6.to_ipv4_mapped().map_or_else(

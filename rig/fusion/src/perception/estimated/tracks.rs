@@ -1,6 +1,5 @@
 //! Assignment of people to places: following, searching, recognizing and losing them.
 
-
 use flyrig_tracker::PoseEstimate;
 use flyrig_types::{FrameSet, Mask};
 
