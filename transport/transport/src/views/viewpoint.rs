@@ -146,7 +146,7 @@ impl Lease {
         let period = self.period();
         let Some(due) = self.next_due else {
             self.next_due = now.checked_add(period);
-            return first_images.take(&self.viewpoint.subscriber, pixels(&self.viewpoint), now);
+            return first_images.take(&self.viewpoint.subscriber, now);
         };
         // A frame set of the same rate that is a little early must not lose its image.
         if now + period / 8 < due {
@@ -189,11 +189,17 @@ impl Leases {
             lease,
             pixels_per_second,
             max_view_pixels: u64::MAX,
-            first_images: FirstImages::new(pixels_per_second),
+            first_images: FirstImages::default(),
             granted: 0,
             refused: 0,
             expired: 0,
         }
+    }
+
+    /// Chooses whether subscribers hold keys, so that each holder has first images of its own.
+    pub(crate) fn with_keys(mut self, has_keys: bool) -> Self {
+        self.first_images.has_keys = has_keys;
+        self
     }
 
     /// Grants, renews, releases or refuses a viewpoint.
@@ -280,8 +286,10 @@ impl Leases {
                 within(most)
             ));
         }
+        let others = self.active.iter().map(|lease| &lease.viewpoint);
+        let taken: f64 = others.filter(|other| other.subscriber != viewpoint.subscriber).map(pixel_rate).sum();
         let budget = self.pixels_per_second as f64;
-        let left = self.free(&viewpoint.subscriber);
+        let left = (budget - taken).max(0.0);
         // Sums of products of whole and of measured rates are not exact to the last bit.
         if pixel_rate(viewpoint) <= left * (1.0 + 1e-9) {
             return Ok(());
@@ -300,12 +308,6 @@ impl Leases {
             mega(left),
             mega(budget)
         ))
-    }
-
-    /// Returns the rate that no subscriber but `except` has been granted, pixels per second.
-    fn free(&self, except: &str) -> f64 {
-        let others = self.active.iter().map(|lease| &lease.viewpoint).filter(|other| other.subscriber != except);
-        (self.pixels_per_second as f64 - others.map(pixel_rate).sum::<f64>()).max(0.0)
     }
 
     /// Sets the largest image, pixels; larger viewpoints end.
@@ -365,7 +367,6 @@ impl Leases {
     }
 
     pub(crate) fn expire(&mut self, now: Instant) {
-        self.first_images.refill(self.free(""), now);
         let before = self.active.len();
         self.active.retain(|lease| lease.ends > now);
         self.refusals.retain(|refusal| refusal.ends > now);
