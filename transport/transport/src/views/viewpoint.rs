@@ -123,11 +123,6 @@ struct Lease {
 }
 
 impl Lease {
-    /// Returns the time from one image to the next.
-    fn period(&self) -> Duration {
-        saturating_secs(1.0 / self.viewpoint.max_fps)
-    }
-
     /// Replaces viewpoint and end. Pixels that were earned towards the next image stay earned at another size or rate.
     fn renew(&mut self, viewpoint: Viewpoint, ends: Instant, now: Instant) {
         let before = std::mem::replace(&mut self.viewpoint, viewpoint);
@@ -143,10 +138,12 @@ impl Lease {
 
     /// Returns whether an image is due, and schedules the next one a period later.
     fn take_due(&mut self, first_images: &mut FirstImages, now: Instant) -> bool {
-        let period = self.period();
+        let period = saturating_secs(1.0 / self.viewpoint.max_fps);
         let Some(due) = self.next_due else {
-            self.next_due = now.checked_add(period);
-            return first_images.take(&self.viewpoint.subscriber, now);
+            let is_first = first_images.take(&self.viewpoint.subscriber, now);
+            // One that waits does so for a whole period, not for one that may be a little early.
+            self.next_due = now.checked_add(if is_first { period } else { period + period / 8 });
+            return is_first;
         };
         // A frame set of the same rate that is a little early must not lose its image.
         if now + period / 8 < due {
