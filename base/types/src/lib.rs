@@ -24,6 +24,7 @@ mod person;
 mod pose;
 mod rendered_view;
 mod restarts;
+mod seconds;
 mod supervised;
 mod whole_file;
 
@@ -40,5 +41,6 @@ pub use person::PersonId;
 pub use pose::{Pose, PoseError, PoseTrack};
 pub use rendered_view::RenderedView;
 pub use restarts::Restarts;
+pub use seconds::{deadline_after, saturating_secs};
 pub use supervised::{SupervisedThread, ThreadHealth, ThreadWatch};
 pub use whole_file::write_whole;

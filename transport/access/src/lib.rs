@@ -29,6 +29,8 @@ mod issue;
 mod key_file;
 mod limits;
 mod listener;
+mod open_files;
+mod places;
 mod probe;
 mod ring_folder;
 mod role;

@@ -375,7 +375,7 @@ impl Inbox {
         timeout: Duration,
         mut ready: impl FnMut(&mut State) -> Option<T>,
     ) -> Result<Option<T>, TransportError> {
-        let deadline = Instant::now() + timeout;
+        let deadline = flyrig_types::deadline_after(timeout);
         let mut state: MutexGuard<'_, State> = lock(&self.state);
         loop {
             if !state.erred

@@ -99,7 +99,8 @@ impl Publisher {
         let splats = Arc::new(Topic::new("splats".to_owned(), "splats".to_owned(), MessageKind::Splats));
         let stats = Arc::new(Topic::new("stats".to_owned(), "stats".to_owned(), MessageKind::Stats));
         let lease = Duration::from_millis(config.viewpoint_lease_millis);
-        let leases = Leases::new(config.max_viewers, lease, config.viewpoint_pixels_per_second);
+        let leases =
+            Leases::new(config.max_viewers, lease, config.viewpoint_pixels_per_second).with_keys(gate.is_some());
         let people = Arc::new(PublishedPeople::new());
         let mut topics = vec![splats.clone(), stats.clone()];
         topics.extend(people.first_topics());

@@ -249,7 +249,7 @@ impl Subscriber {
     /// images arrive through [`Self::next_view`] as the view [`Self::viewpoint_view`].
     ///
     /// # Errors
-    /// `Config` when the camera is not valid, larger than 4096 pixels per side, or `max_fps` is not in 0..=1000.
+    /// `Config` when the camera is not valid, larger than 4096 pixels per side, or another number, `max_fps` included (0.01 to 1000), is out of its range.
     pub fn request_viewpoint(&self, camera: &Camera, max_fps: f64) -> Result<(), TransportError> {
         check_camera("our viewpoint", camera, max_fps)?;
         self.renewal.want(Some((camera.clone(), max_fps)));

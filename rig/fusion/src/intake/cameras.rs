@@ -112,7 +112,7 @@ impl Intake {
 
     /// Waits for the next frame set. Returns `None` when none came in time or all cameras have ended (see [`Self::ended`]).
     pub fn next_set(&mut self, timeout: Duration) -> Option<FrameSet> {
-        let deadline = Instant::now() + timeout;
+        let deadline = flyrig_types::deadline_after(timeout);
         loop {
             self.ingest_waiting(deadline);
             if !self.every_set && self.ready.len() > 1 {

@@ -138,7 +138,7 @@ impl CameraSubscriber {
     /// `UnknownVersion` or `Malformed` for a message that could not be used, the same text once in ten seconds; the subscriber stays usable.
     /// `Config` for a camera that was not named at the start.
     pub fn next_frame(&self, camera: &CameraId, timeout: Duration) -> Result<Option<Frame>, TransportError> {
-        let deadline = Instant::now() + timeout;
+        let deadline = flyrig_types::deadline_after(timeout);
         let mut inbox = lock(&self.shared.inbox);
         loop {
             if let Some(result) = inbox.take(camera)? {

@@ -333,7 +333,8 @@ mod tests {
                 self.random =
                     self.random.wrapping_mul(6_364_136_223_846_793_005).wrapping_add(1_442_695_040_888_963_407);
                 let share = (self.random >> 33) as f64 / f64::from(1u32 << 31);
-                self.turns[thread] += self.pauses[thread].mul_f64(0.1 + 0.9 * share);
+                let pause = self.pauses[thread].as_secs_f64() * (0.1 + 0.9 * share);
+                self.turns[thread] += flyrig_types::saturating_secs(pause);
             }
             self.turns[thread]
         }
@@ -486,7 +487,7 @@ mod tests {
     /// Fetches a template of 1.2 MB at a rate, bytes per second.
     fn fetch(line: &mut Line, bytes_per_sec: f64) {
         line.layers.fetch_begins(line.now);
-        line.now += Duration::from_secs_f64(1.2e6 / bytes_per_sec);
+        line.now += flyrig_types::saturating_secs(1.2e6 / bytes_per_sec);
         line.layers.fetch_ends(line.now, 1_200_000);
         line.run(1);
     }
@@ -523,7 +524,7 @@ mod tests {
             let mut line = Line::new(LAYERS);
             line.layers.fetch_begins(line.now);
             line.layers.fetch_begins(line.now);
-            line.now += Duration::from_secs_f64(bytes as f64 / rate);
+            line.now += flyrig_types::saturating_secs(bytes as f64 / rate);
             line.layers.fetch_ends(line.now, 0);
             line.layers.fetch_ends(line.now, bytes);
             line.run(5);
