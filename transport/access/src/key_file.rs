@@ -4,7 +4,14 @@ use std::path::Path;
 
 use serde::{Deserialize, Serialize};
 
-use crate::{error::AccessError, holder::Holder, issue::CertificatePair, role::Role, secret_file::write_secret, tls};
+use crate::{
+    error::AccessError,
+    holder::{Holder, covers},
+    issue::CertificatePair,
+    role::Role,
+    secret_file::write_secret,
+    tls,
+};
 
 /// Largest key file that is read, bytes.
 const MAX_KEY_FILE_BYTES: u64 = 64 << 10;
@@ -23,6 +30,9 @@ pub struct KeyFile {
     pub holder: String,
     /// Role of the holder.
     pub role: Role,
+    /// Cameras that a holder of role [`Role::Cameras`] may send; every camera where none is named, as in older keys.
+    #[serde(default, skip_serializing_if = "Vec::is_empty")]
+    pub cameras: Vec<String>,
     /// Name in topics: the ring's identifier and the holder's number.
     pub topic_name: String,
     /// Addresses of the rig, `HOST:PORT`.
@@ -66,6 +76,7 @@ impl KeyFile {
             rig: rig.to_owned(),
             holder: holder.name.clone(),
             role: holder.role,
+            cameras: holder.cameras.clone(),
             topic_name,
             connect,
             expires: holder.expires.clone(),
@@ -130,6 +141,12 @@ impl KeyFile {
             return Err("rig_certificate_name".to_owned());
         }
         tls::client(&self.authority, &self.certificate, &self.private_key).map(|_| ())
+    }
+
+    /// Returns whether the rig takes this camera from the holder.
+    #[must_use]
+    pub fn may_send(&self, camera: &str) -> bool {
+        self.role == Role::Cameras && covers(&self.cameras, camera)
     }
 
     /// Writes a file that only its owner may read.
