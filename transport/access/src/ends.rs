@@ -35,7 +35,8 @@ impl KeyEnds {
     pub fn read(folder: &Path, now: SystemTime) -> Result<Self, AccessError> {
         let valid = read_holders(folder)?.into_iter().filter(|holder| !holder.revoked && holder.expires_at() > now);
         let next_key = valid.min_by_key(Holder::expires_at).map(|holder| (holder.expires_at(), holder.name));
-        let certificate = certificate_end(&read_certificate(folder)?).map_err(|error| AccessError::file(folder, error))?;
+        let certificate =
+            certificate_end(&read_certificate(folder)?).map_err(|error| AccessError::file(folder, error))?;
         Ok(Self { next_key: next_key.map(|(end, name)| (name, end)), certificate })
     }
 }

@@ -179,8 +179,7 @@ impl HolderList {
         let list = &*self.0;
         let number = topic_name.strip_prefix(&list.topic_prefix).and_then(|number| number.parse().ok());
         let holders = lock(&list.holders);
-        let holder =
-            holders.iter().find(|of| !of.revoked && of.role == Role::Cameras && Some(of.number) == number);
+        let holder = holders.iter().find(|of| !of.revoked && of.role == Role::Cameras && Some(of.number) == number);
         if holder.is_some_and(|holder| covers(&holder.cameras, camera)) {
             return true;
         }
@@ -243,9 +242,7 @@ impl List {
             Err(error) => {
                 let count = self.failures.fetch_add(1, Ordering::Relaxed) + 1;
                 if count.is_power_of_two() {
-                    tracing::warn!(
-                        "keys: the list cannot be read and stays as it was ({count} times so far): {error}"
-                    );
+                    tracing::warn!("keys: the list cannot be read and stays as it was ({count} times so far): {error}");
                 }
             }
         }
@@ -430,7 +427,9 @@ async fn greet(connection: Connection, shared: Arc<Shared>) {
     };
     tracing::info!("keys: {who} ({}) connected", holder.role.name());
     if holder.role == Role::Cameras && holder.cameras.is_empty() {
-        tracing::warn!("keys: {who} may send every camera, since its key names none; revoke it, and add it with --camera");
+        tracing::warn!(
+            "keys: {who} may send every camera, since its key names none; revoke it, and add it with --camera"
+        );
     }
     tokio::select! {
         _ = copy_bidirectional_with_sizes(&mut client, &mut session, COPY_BYTES, COPY_BYTES) => tracing::info!("keys: {who} left"),

@@ -154,7 +154,10 @@ impl Ring {
         let own = authority.sign(&own_name(&list), &list.hosts, TlsSide::Server, valid)?;
         let failed = |error: std::io::Error| match error.kind() {
             std::io::ErrorKind::AlreadyExists if folder.join(AUTHORITY[1]).exists() && !folder.join(LIST).exists() => {
-                AccessError::file(folder, "holds half a ring, whose `flyrig keys new` was ended midway; delete it first")
+                AccessError::file(
+                    folder,
+                    "holds half a ring, whose `flyrig keys new` was ended midway; delete it first",
+                )
             }
             std::io::ErrorKind::AlreadyExists => {
                 AccessError::file(folder, "is there already; name a new folder with --out")
@@ -448,8 +451,7 @@ impl Ring {
         self.forget_oldest();
         let Some(file) = file else { return self.save().map(|()| key) };
         lock.begin(file)?;
-        let written =
-            key.write_new(file).and_then(|()| self.save().inspect_err(|_| drop(std::fs::remove_file(file))));
+        let written = key.write_new(file).and_then(|()| self.save().inspect_err(|_| drop(std::fs::remove_file(file))));
         lock.end();
         written.map(|()| key)
     }

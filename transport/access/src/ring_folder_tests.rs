@@ -35,10 +35,188 @@ fn a_ring_and_its_keys_come_back_as_they_were_made() {
 }
 
 #[test]
+fn a_rig_with_an_ipv6_host_listens_on_ipv6() {
+    let folder = tempfile::tempdir().unwrap();
+    let new = |name: &str, hosts: &[&str]| {
+        let hosts: Vec<String> = hosts.iter().map(|host| (*host).to_owned()).collect();
+        Ring::create(&folder.path().join(name), "studio", &hosts, 9000)
+    };
+    for (n, (hosts, listen, connect)) in [
+        (&["fd00::5"][..], "[::]:9000", "[fd00::5]:9000"),
+        (&["[fd00:0::5]"], "[::]:9000", "[fd00::5]:9000"),
+        (&["rig.local", "::1"], "[::]:9000", "rig.local:9000"),
+        (&["rig.local"], "0.0.0.0:9000", "rig.local:9000"),
+        (&["10.0.0.5"], "0.0.0.0:9000", "10.0.0.5:9000"),
+    ]
+    .into_iter()
+    .enumerate()
+    {
+        let mut ring = new(&n.to_string(), hosts).unwrap();
+        assert_eq!(ring.address(Role::Viewer).to_string(), listen, "{hosts:?}");
+        assert_eq!(ring.address(Role::Cameras).port(), 9001);
+        assert_eq!(ring.add("desk", Role::Viewer, 1).unwrap().connect[0], connect, "{hosts:?}");
+    }
+    for (host, part) in [
+        ("fe80::1%eth0", "--host fe80::1%eth0: other computers cannot use a link-local address or a zone"),
+        ("[fe80::1]", "link-local"),
+        ("fd00::5%2", "a zone"),
+        ("::", "no computer is reached"),
+        ("0.0.0.0", "no computer is reached"),
+        ("[fd00::5]:9000", "without a port"),
+        ("[rig.local]", "without a port"),
+        ("fd00::g", "without a port"),
+        ("a\u{1b}[2Jb", "--host a\\u{1b}[2Jb: give a name"),
+    ] {
+        let text = new("bad", &[host]).unwrap_err().to_string();
+        assert!(text.contains(part), "{host}: {text}");
+    }
+    assert!(new("bad", &["a"; 65]).unwrap_err().to_string().contains("at most 64"));
+}
+
+#[test]
+fn a_camera_key_names_its_cameras_and_keeps_them_when_it_is_renewed() {
+    let (folder, mut ring) = new_ring();
+    let file = |name: &str| folder.path().join(name);
+    let names = |names: &[&str]| -> Vec<String> { names.iter().map(|name| (*name).to_owned()).collect() };
+    let key = ring.add_file(&file("a.key"), "a", Role::Cameras, &names(&["left", "cam.2"]), 1).unwrap();
+    assert_eq!(KeyFile::read(&file("a.key"), &[Role::Cameras]).unwrap(), key);
+    assert!(key.may_send("left") && key.may_send("cam.2") && !key.may_send("right"));
+    let again = ring.renew_file(&file("b.key"), "a", 1).unwrap();
+    assert_eq!(again.cameras, key.cameras);
+    let of_list = || Ring::open(ring.folder()).unwrap().valid_holder("a").unwrap().cameras.clone();
+    assert_eq!(of_list(), key.cameras);
+    // Keys without names, such as older ones, send every camera.
+    let old = ring.add("old", Role::Cameras, 1).unwrap();
+    assert!(old.may_send("left") && old.cameras.is_empty());
+    let listed = std::fs::read_to_string(ring.folder().join(LIST)).unwrap();
+    assert_eq!(listed.matches("cameras = [").count(), 1, "{listed}");
+    assert!(!ring.add("desk", Role::Viewer, 1).unwrap().may_send("left"));
+    for (role, cameras, part) in [
+        (Role::Viewer, names(&["left"]), "a key of role viewer sends no cameras; add --role cameras"),
+        (Role::Cameras, names(&["left", "a/b"]), "--camera 'a/b'"),
+        (Role::Cameras, names(&["*"]), "--camera '*'"),
+        (Role::Cameras, names(&[""]), "--camera ''"),
+        (Role::Cameras, names(&["x"; 33]), "33 are too many"),
+    ] {
+        let error = ring.add_file(&file("c.key"), "c", role, &cameras, 1).unwrap_err().to_string();
+        assert!(error.contains(part) && !file("c.key").exists(), "{error}");
+    }
+}
+
+#[test]
+fn changes_at_the_same_time_are_all_kept() {
+    let (folder, mut ring) = new_ring();
+    let file = |name: &str| folder.path().join(name);
+    for n in 0..30 {
+        ring.add_file(&file(&format!("r{n}.key")), &format!("r{n}"), Role::Viewer, &[], 1).unwrap();
+        ring.add_file(&file(&format!("g{n}.key")), &format!("g{n}"), Role::Viewer, &[], 1).unwrap();
+    }
+    std::thread::scope(|scope| {
+        for n in 0..100 {
+            let (mut ring, file) = (Ring::open(ring.folder()).unwrap(), &file);
+            let work = move || match n {
+                0..40 => {
+                    drop(ring.add_file(&file(&format!("a{n}.key")), &format!("a{n}"), Role::Relay, &[], 1).unwrap())
+                }
+                40..70 => ring.revoke(&format!("g{}", n - 40)).unwrap(),
+                _ => {
+                    let name = format!("r{}", n - 70);
+                    drop(ring.renew_file(&file(&format!("{name}.new.key")), &name, 1).unwrap());
+                }
+            };
+            std::thread::Builder::new().name("keys".to_owned()).spawn_scoped(scope, work).unwrap();
+        }
+    });
+    let ring = Ring::open(ring.folder()).unwrap();
+    let print = |name: &str| {
+        let key = KeyFile::read(&file(name), &Role::ALL).unwrap();
+        fingerprint(&CertificateDer::from_pem_slice(key.certificate.as_bytes()).unwrap())
+    };
+    let is_valid = |name: &str| ring.holders().iter().any(|of| of.fingerprint == print(name) && !of.revoked);
+    assert!((0..40).all(|n| is_valid(&format!("a{n}.key"))), "every key that was added is listed");
+    assert!((0..30).all(|n| !is_valid(&format!("g{n}.key"))), "every revocation holds");
+    assert!((0..30).all(|n| is_valid(&format!("r{n}.new.key")) && !is_valid(&format!("r{n}.key"))), "every renewal");
+    let mut numbers: Vec<usize> = ring.holders().iter().filter(|of| !of.revoked).map(|of| of.number).collect();
+    numbers.sort_unstable();
+    numbers.dedup();
+    assert_eq!(numbers.len(), 70, "no two holders have one number");
+}
+
+#[test]
+fn what_cannot_be_written_changes_nothing() {
+    let (folder, mut ring) = new_ring();
+    let file = folder.path().join("desk.key");
+    ring.add_file(&file, "desk", Role::Viewer, &[], 1).unwrap();
+    let before = std::fs::read(ring.folder().join(LIST)).unwrap();
+    let nowhere = folder.path().join("no/such/desk.key");
+    for (error, part) in [
+        (ring.renew_file(&nowhere, "desk", 1), "no/such/desk.key: cannot be written"),
+        (ring.renew_file(&file, "desk", 1), "desk.key: is there already"),
+        (ring.add_file(&nowhere, "two", Role::Viewer, &[], 1), "cannot be written"),
+    ] {
+        let text = error.unwrap_err().to_string();
+        assert!(text.contains(part), "{text}");
+        assert_eq!(std::fs::read(ring.folder().join(LIST)).unwrap(), before, "{part}");
+    }
+    assert!(ring.valid_holder("desk").is_some() && ring.holders().len() == 1);
+    // The key can be written and the list cannot, as on a full disk: a folder lies where the list is written first.
+    let partial = ring.folder().join(format!("{LIST}.{}.partial", std::process::id()));
+    std::fs::create_dir(&partial).unwrap();
+    let new = folder.path().join("new.key");
+    for error in [ring.renew_file(&new, "desk", 1), ring.add_file(&new, "two", Role::Viewer, &[], 1)] {
+        let text = error.unwrap_err().to_string();
+        assert!(text.contains("ring.toml: cannot be written"), "{text}");
+        assert!(!new.exists(), "a key that is not listed does not stay");
+    }
+    assert!(ring.revoke("desk").is_err() && ring.valid_holder("desk").is_some());
+    assert_eq!(std::fs::read(ring.folder().join(LIST)).unwrap(), before);
+    std::fs::remove_dir(partial).unwrap();
+    ring.renew_file(&new, "desk", 1).unwrap();
+    assert_eq!(Ring::open(ring.folder()).unwrap().holders(), ring.holders());
+}
+
+#[test]
+fn a_command_that_was_ended_between_key_and_list_is_undone_by_the_next() {
+    let (folder, mut ring) = new_ring();
+    let (list, file) = (ring.folder().join(LIST), folder.path().join("new.key"));
+    ring.add("desk", Role::Viewer, 1).unwrap();
+    let before = std::fs::read(&list).unwrap();
+    let note = |file: &Path| FolderLock::take(ring.folder()).unwrap().begin(file).unwrap();
+    let mut other = Ring::open(ring.folder()).unwrap();
+    // The key is written, the list is not.
+    other.renew_file(&file, "desk", 1).unwrap();
+    std::fs::write(&list, &before).unwrap();
+    note(&file);
+    other.refresh().unwrap();
+    assert!(!file.exists() && !ring.folder().join("ring.unfinished").exists());
+    assert_eq!(std::fs::read(&list).unwrap(), before, "the old key is valid");
+    // The next command takes the same name, without a word about a file that is there.
+    other.renew_file(&file, "desk", 1).unwrap();
+    std::fs::write(&list, &before).unwrap();
+    note(&file);
+    let again = other.renew_file(&file, "desk", 1).unwrap();
+    assert_eq!(KeyFile::read(&file, &Role::ALL).unwrap(), again);
+    // Ended after the list, and before a key was written: nothing is removed.
+    note(&file);
+    other.refresh().unwrap();
+    assert!(file.exists(), "its key is listed");
+    let foreign = folder.path().join("mine.txt");
+    std::fs::write(&foreign, "text").unwrap();
+    note(&foreign);
+    other.refresh().unwrap();
+    assert!(foreign.exists(), "a file that is no key of this ring stays");
+    let (_folder, mut stranger) = new_ring();
+    let foreign = folder.path().join("stranger.key");
+    stranger.add_file(&foreign, "desk", Role::Viewer, &[], 1).unwrap();
+    note(&foreign);
+    other.refresh().unwrap();
+    assert!(foreign.exists(), "nor does a key of another rig go");
+}
+
+#[test]
 fn numbers_are_given_once_and_again_after_they_were_revoked() {
     let (_folder, mut ring) = new_ring();
-    let names: Vec<String> =
-        (0..4).map(|n| ring.add(&format!("v{n}"), Role::Viewer, 1).unwrap().topic_name).collect();
+    let names: Vec<String> = (0..4).map(|n| ring.add(&format!("v{n}"), Role::Viewer, 1).unwrap().topic_name).collect();
     assert!(names.iter().enumerate().all(|(n, name)| name.ends_with(&format!("-{n}"))), "{names:?}");
     ring.revoke("v1").unwrap();
     assert_eq!(ring.add("v4", Role::Viewer, 1).unwrap().topic_name, names[1]);

@@ -10,9 +10,8 @@ pub(crate) fn write_secret(path: &Path, text: &str) -> Result<(), AccessError> {
     options.write(true).create_new(true);
     #[cfg(unix)]
     std::os::unix::fs::OpenOptionsExt::mode(&mut options, 0o600);
-    let written = options
-        .open(path)
-        .and_then(|mut out| write(&mut out, text).inspect_err(|_| drop(std::fs::remove_file(path))));
+    let written =
+        options.open(path).and_then(|mut out| write(&mut out, text).inspect_err(|_| drop(std::fs::remove_file(path))));
     written.map_err(|error| match error.kind() {
         std::io::ErrorKind::AlreadyExists => {
             AccessError::file(path, "is there already; choose another name, or move it away")
