@@ -106,12 +106,14 @@ pub fn keys(action: &KeysAction) -> Result<()> {
             );
         }
         KeysAction::Add { name, role, cameras, file } => {
-            let path = file_of(file.out.as_deref(), name);
-            report(&open(&file.ring)?.add_file(&path, name, *role, cameras, file.days)?, &path);
+            let mut ring = open(&file.ring)?;
+            let path = new_file(&mut ring, file.out.as_deref(), name)?;
+            report(&ring.add_file(&path, name, *role, cameras, file.days)?, &path);
         }
         KeysAction::Renew { name, file } => {
-            let path = file_of(file.out.as_deref(), name);
-            report(&open(&file.ring)?.renew_file(&path, name, file.days)?, &path);
+            let mut ring = open(&file.ring)?;
+            let path = new_file(&mut ring, file.out.as_deref(), name)?;
+            report(&ring.renew_file(&path, name, file.days)?, &path);
             eprintln!("keys: the old key of '{name}' is refused from now on");
         }
         KeysAction::Revoke { name, ring } => {
@@ -170,9 +172,16 @@ fn open(RingArgs { ring }: &RingArgs) -> Result<Ring> {
     }
 }
 
-/// Returns the file of a new key.
-fn file_of(out: Option<&Path>, name: &str) -> PathBuf {
-    out.map_or_else(|| PathBuf::from(format!("{name}.key")), Path::to_owned)
+/// Returns the file of a new key, which must not exist; one that an ended command left there is removed.
+fn new_file(ring: &mut Ring, out: Option<&Path>, name: &str) -> Result<PathBuf> {
+    ring.refresh()?;
+    let path = out.map_or_else(|| PathBuf::from(format!("{name}.key")), Path::to_owned);
+    anyhow::ensure!(
+        !path.exists(),
+        "{} is there already; move it away, or name another file with --out",
+        path.display()
+    );
+    Ok(path)
 }
 
 /// Prints where a new key is, and how it is used.

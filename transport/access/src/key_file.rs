@@ -15,6 +15,8 @@ use crate::{
 
 /// Largest key file that is read, bytes.
 const MAX_KEY_FILE_BYTES: u64 = 64 << 10;
+/// Beginning of every key file.
+const BEGINNING: &str = "# Key of '";
 /// Version of the format.
 const VERSION: u32 = 1;
 
@@ -127,6 +129,13 @@ impl KeyFile {
         Ok(key)
     }
 
+    /// Returns whether a file holds the beginning of a key, or nothing yet, as [`Self::write_new`] leaves it when its process is ended.
+    pub(crate) fn is_half(path: &Path) -> bool {
+        let is_beginning =
+            |text: Vec<u8>| text.starts_with(BEGINNING.as_bytes()) || BEGINNING.as_bytes().starts_with(&text);
+        std::fs::read(path).is_ok_and(is_beginning) && Self::read_any(path).is_err()
+    }
+
     /// Checks the fields that other modules rely on.
     fn check(&self) -> Result<(), String> {
         let is_name = |text: &str| {
@@ -156,7 +165,7 @@ impl KeyFile {
     pub fn write_new(&self, path: &Path) -> Result<(), AccessError> {
         let body = toml::to_string(self).map_err(AccessError::system)?;
         let text = format!(
-            "# Key of '{}' ({}) to the rig '{}', valid until {}.\n# Keep it secret: its holder connects as '{}'.\n{body}",
+            "{BEGINNING}{}' ({}) to the rig '{}', valid until {}.\n# Keep it secret: its holder connects as '{}'.\n{body}",
             self.holder,
             self.role.name(),
             self.rig,

@@ -18,7 +18,7 @@ use crate::{
     issue::{Authority, CertificatePair, TlsSide},
     key_file::KeyFile,
     role::Role,
-    secret_file::write_secret,
+    secret_file::{already_there, write_secret},
 };
 
 /// Default port of the gate for viewers; cameras have the next port.
@@ -339,23 +339,20 @@ impl Ring {
     /// Removes the key file of a command that was ended before the list named its key.
     fn finish_change(&self, lock: &FolderLock) {
         let Some(file) = lock.unfinished() else { return };
-        match KeyFile::read(&file, &Role::ALL) {
-            Ok(key) if self.is_unlisted(&key) => match std::fs::remove_file(&file) {
+        let is_void = match KeyFile::read(&file, &Role::ALL) {
+            Ok(key) => self.is_unlisted(&key),
+            Err(_) => KeyFile::is_half(&file),
+        };
+        if is_void {
+            let file_name = file.display();
+            match std::fs::remove_file(&file) {
                 Ok(()) => tracing::warn!(
-                    "keys: {} was removed: an earlier command was ended before its key became valid",
-                    file.display()
+                    "keys: {file_name} was removed: an earlier command was ended before its key became valid"
                 ),
                 Err(error) => tracing::warn!(
-                    "keys: the key in {} is not valid, since an earlier command was ended midway; delete it ({error})",
-                    file.display()
+                    "keys: {file_name} is not valid, since an earlier command was ended midway; delete it ({error})"
                 ),
-            },
-            Ok(_) => {}
-            Err(_) if file.exists() => tracing::warn!(
-                "keys: {} may be half a key, since an earlier command was ended midway; delete it",
-                file.display()
-            ),
-            Err(_) => {}
+            }
         }
         lock.end();
     }
@@ -450,6 +447,10 @@ impl Ring {
         self.list.holders.push(holder);
         self.forget_oldest();
         let Some(file) = file else { return self.save().map(|()| key) };
+        // Also before the note: a file that is there already is no half of this key.
+        if file.exists() {
+            return Err(already_there(file));
+        }
         lock.begin(file)?;
         let written = key.write_new(file).and_then(|()| self.save().inspect_err(|_| drop(std::fs::remove_file(file))));
         lock.end();

@@ -200,6 +200,15 @@ fn a_command_that_was_ended_between_key_and_list_is_undone_by_the_next() {
     note(&file);
     other.refresh().unwrap();
     assert!(file.exists(), "its key is listed");
+    // Ended while the key was written.
+    let whole = std::fs::read_to_string(&file).unwrap();
+    for half in ["", "# Key", &whole[..whole.len() / 2]] {
+        let file = folder.path().join("half.key");
+        std::fs::write(&file, half).unwrap();
+        note(&file);
+        other.refresh().unwrap();
+        assert!(!file.exists(), "{half}");
+    }
     let foreign = folder.path().join("mine.txt");
     std::fs::write(&foreign, "text").unwrap();
     note(&foreign);
