@@ -451,7 +451,7 @@ impl Ring {
         if file.exists() {
             return Err(already_there(file));
         }
-        lock.begin(file)?;
+        lock.begin(file).inspect_err(|_| lock.end())?;
         let written = key.write_new(file).and_then(|()| self.save().inspect_err(|_| drop(std::fs::remove_file(file))));
         lock.end();
         written.map(|()| key)

@@ -116,12 +116,13 @@ fn changes_at_the_same_time_are_all_kept() {
             let (mut ring, file) = (Ring::open(ring.folder()).unwrap(), &file);
             let work = move || match n {
                 0..40 => {
-                    drop(ring.add_file(&file(&format!("a{n}.key")), &format!("a{n}"), Role::Relay, &[], 1).unwrap())
+                    let name = format!("a{n}");
+                    ring.add_file(&file(&format!("{name}.key")), &name, Role::Relay, &[], 1).unwrap();
                 }
                 40..70 => ring.revoke(&format!("g{}", n - 40)).unwrap(),
                 _ => {
                     let name = format!("r{}", n - 70);
-                    drop(ring.renew_file(&file(&format!("{name}.new.key")), &name, 1).unwrap());
+                    ring.renew_file(&file(&format!("{name}.new.key")), &name, 1).unwrap();
                 }
             };
             std::thread::Builder::new().name("keys".to_owned()).spawn_scoped(scope, work).unwrap();
