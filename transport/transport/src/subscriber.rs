@@ -114,7 +114,7 @@ impl Subscriber {
         let largest = MAX_MESSAGE_BYTES.max(MAX_SPLAT_BYTES) + LARGEST_QUESTION;
         let Opened { session, .. } = opening::open(config, largest, &[])?;
         let id = session.zid().to_string();
-        let id = config.key.as_ref().map_or_else(|| id.clone(), |key| format!("{}.{id}", key.topic_name));
+        let id = config.key.as_ref().map_or_else(|| id.clone(), |key| keys::session_name(&key.topic_name, &id));
         let inbox = Arc::new(Inbox::new(format!("{VIEWER_PREFIX}{id}"), config.inbox_bytes));
 
         let mut labels = vec!["calibration/*".to_owned(), "transforms".to_owned(), format!("viewer/{id}/view")];

@@ -222,9 +222,10 @@ impl TransportConfig {
 /// Prefix of the endpoints of rigs with keys.
 const TLS: &str = "tls/";
 
-/// Returns the endpoint of a rig with keys.
+/// Returns the endpoint of a rig with keys. zenoh takes the part before the last colon for the name in the rig's certificate, and knows
+/// no address in brackets.
 pub(crate) fn tls_endpoint(address: &str) -> String {
-    format!("{TLS}{address}")
+    format!("{TLS}{}", address.replace(['[', ']'], ""))
 }
 
 /// Returns whether only programs of this computer reach an endpoint.
