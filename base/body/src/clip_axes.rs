@@ -87,9 +87,11 @@ impl MotionClip {
         }
         let Some((up, &most)) = votes.iter().enumerate().rev().max_by_key(|(_, votes)| **votes) else { return 0 };
         // A rest pose shows the axes too, where it is one: the legs lead away from the trunk.
-        let leg = self.origins[legs[0].0[2]] - self.origins[legs[0].0[0]];
-        let trunk = self.origins[top] - self.origins[legs[0].0[0]];
-        let rest = axis(&|joint| self.origins[joint]).filter(|_| leg.dot(trunk) < 0.0);
+        let leads_away = legs.iter().all(|([hip, _, ankle], _)| {
+            let hip = self.origins[*hip];
+            (self.origins[*ankle] - hip).dot(self.origins[top] - hip) < 0.0
+        });
+        let rest = axis(&|joint| self.origins[joint]).filter(|_| leads_away);
         match rest {
             _ if up == 0 || most == 0 => 0,
             Some(0) => {

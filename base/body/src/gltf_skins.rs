@@ -43,11 +43,16 @@ impl BodySkins {
     /// # Errors
     /// [`BodyError::Gltf`] without a skin, over a limit, or with inverse bind matrices that are missing or cannot be inverted.
     pub fn new(file: &GltfFile<'_>, nodes: &Nodes) -> Result<Self, BodyError> {
-        let mut vertices = BTreeMap::new();
+        let count = |mesh: gltf::Mesh<'_>| {
+            let positions = mesh.primitives().filter_map(|primitive| primitive.get(&gltf::Semantic::Positions));
+            positions.map(|accessor| accessor.count()).fold(0, usize::saturating_add)
+        };
+        let counts: Vec<usize> = file.document.meshes().map(count).collect();
+        let mut vertices: BTreeMap<usize, usize> = BTreeMap::new();
         for node in file.document.nodes() {
             if let (Some(skin), Some(mesh)) = (node.skin(), node.mesh()) {
-                let positions = mesh.primitives().filter_map(|primitive| primitive.get(&gltf::Semantic::Positions));
-                *vertices.entry(skin.index()).or_insert(0) += positions.map(|accessor| accessor.count()).sum::<usize>();
+                let sum = vertices.entry(skin.index()).or_insert(0);
+                *sum = sum.saturating_add(counts[mesh.index()]);
             }
         }
         let all = file.document.skins().count();
@@ -62,7 +67,9 @@ impl BodySkins {
             let nodes = body.iter().flat_map(|&skin| &skins[skin].joint_nodes);
             nodes.collect::<std::collections::BTreeSet<_>>().len()
         };
-        let size = |body: &&Vec<usize>| (joints(body), body.iter().map(|&skin| skins[skin].vertices).sum::<usize>());
+        let size = |body: &&Vec<usize>| {
+            (joints(body), body.iter().map(|&skin| skins[skin].vertices).fold(0, usize::saturating_add))
+        };
         let Some(body) = bodies.iter().rev().max_by_key(size) else {
             return Err(file.fail("no skin; export the body with its armature"));
         };
@@ -97,8 +104,8 @@ impl BodySkins {
 
     /// Adds a skin; `world` holds the nodes at rest.
     fn join(&mut self, skin: &FileSkin, world: &[DMat4]) {
-        let known = |node: &usize| self.joint_nodes.iter().position(|joint| joint == node);
-        let places: Vec<Option<usize>> = skin.joint_nodes.iter().map(known).collect();
+        let mut known: BTreeMap<usize, usize> = self.joint_nodes.iter().copied().zip(0..).collect();
+        let places: Vec<Option<usize>> = skin.joint_nodes.iter().map(|node| known.get(node).copied()).collect();
         let from_mesh = |joint: usize, own: usize| self.inverse_binds[joint].inverse() * skin.inverse_binds[own];
         // By a shared joint, or else as the nodes rest.
         let shared = places.iter().enumerate().find_map(|(own, &joint)| Some(from_mesh(joint?, own)));
@@ -113,12 +120,13 @@ impl BodySkins {
         let body_from_mesh: Vec<DMat4> = places.iter().enumerate().map(own_matrix).collect();
         let is_same = body_from_mesh.iter().all(|matrix| matrix.abs_diff_eq(DMat4::IDENTITY, 1e-9));
         let mut joints = Vec::with_capacity(places.len());
-        for (own, place) in places.into_iter().enumerate() {
-            joints.push(place.unwrap_or_else(|| {
-                self.joint_nodes.push(skin.joint_nodes[own]);
-                self.inverse_binds.push(skin.inverse_binds[own] * common.inverse());
-                self.joint_nodes.len() - 1
-            }));
+        for (&node, inverse_bind) in skin.joint_nodes.iter().zip(&skin.inverse_binds) {
+            let joint = *known.entry(node).or_insert(self.joint_nodes.len());
+            if joint == self.joint_nodes.len() {
+                self.joint_nodes.push(node);
+                self.inverse_binds.push(*inverse_bind * common.inverse());
+            }
+            joints.push(joint);
         }
         let body_from_mesh = (!is_same).then_some(body_from_mesh);
         self.skins.insert(skin.index, BodySkin { joints, body_from_mesh });
@@ -155,6 +163,9 @@ fn bodies(nodes: &Nodes, skins: &[FileSkin]) -> Vec<Vec<usize>> {
     // The body of each skin, by its first skin.
     let mut body: Vec<usize> = (0..skins.len()).collect();
     let mut merge = |a: usize, b: usize| {
+        if body[a] == body[b] {
+            return;
+        }
         let (from, to) = (body[a].max(body[b]), body[a].min(body[b]));
         body.iter_mut().filter(|body| **body == from).for_each(|body| *body = to);
     };

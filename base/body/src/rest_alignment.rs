@@ -13,14 +13,24 @@ const FRAMES: usize = 64;
 /// bones along one axis, for example.
 const FARTHEST: f64 = 75.0 * std::f64::consts::PI / 180.0;
 
-/// Limb joint of the skeleton, in canonical axes.
-struct Limb {
+/// Weight of the bend of the elbow against the twist of the upper arm, which turns far.
+const BEND: f64 = 2.0;
+
+/// Joint of a limb or of the spine, in canonical axes.
+struct Bone {
     /// Direction of the bone in a T pose.
     along: DVec3,
     /// Direction across the bone that is preserved where bones run along the axes.
     across: DVec3,
-    /// Whether our bone takes the direction of the source's; collars and toes keep their own shape.
+    /// Whether our bone takes the direction of the source's; spine, head, collars and toes keep their own shape.
     follows: bool,
+}
+
+/// Rotations of the trunk at rest, from the axes of a T pose.
+#[derive(Clone, Copy)]
+struct Trunk {
+    ours: DQuat,
+    theirs: DQuat,
 }
 
 /// Rotation of a joint, canonical axes, when the source rests.
@@ -40,28 +50,28 @@ struct Aligned {
 ///
 /// The trunk is turned as a block, by the directions from hips to neck and from hip to hip; neck, arms, legs and feet
 /// take the source's bone directions, hands follow the forearms, collars, head and toes keep their own shape. A source that does not
-/// rest in the pose of a person (all bones along x, as of LAFAN1) is taken to have its zero rotations in axes that a T pose shares:
-/// the quarter turn about the bone is the one at which the limbs are least twisted over the clip.
+/// rest in the pose of a person (all bones along one axis, as in LAFAN1 and the Bandai-Namco dataset) is taken to have axes that
+/// differ from those of a T pose by quarter turns about each bone: the ones at which the joints are least twisted over the clip.
 pub(crate) fn at_source_rest(clip: &MotionClip, skeleton: &Skeleton, source: &[Option<usize>]) -> Vec<DQuat> {
     let alignment = Alignment { clip, skeleton, source, origins: skeleton.canonical_origins() };
-    let trunk = alignment.trunk().unwrap_or(DQuat::IDENTITY);
-    let root = Aligned { turned: trunk, from_t_pose: trunk, source: source[0].unwrap_or(0), odd_bone: None };
+    let trunk = alignment.trunk().unwrap_or(Trunk { ours: DQuat::IDENTITY, theirs: DQuat::IDENTITY });
+    let turned = (trunk.theirs * trunk.ours.inverse()).normalize();
+    let root = Aligned { turned, from_t_pose: trunk.theirs, source: source[0].unwrap_or(0), odd_bone: None };
+    let legs = ["LeftUpLeg", "LeftLeg", "RightUpLeg", "RightLeg"].map(|name| skeleton.joint(name));
+    let is_odd = legs.into_iter().flatten().any(|joint| alignment.is_far(joint, turned));
     let parts = part_of_joints(skeleton);
     let joints = skeleton.joints();
     let mut aligned: Vec<Aligned> = Vec::with_capacity(joints.len());
     for (index, joint) in joints.iter().enumerate() {
         let parent = joint.parent.map_or(root, |parent| aligned[parent]);
         let here = Aligned { source: source[index].unwrap_or(parent.source), ..root };
-        aligned.push(match (alignment.limb(&joint.name, index), parts[index]) {
-            (Some(limb), _) => alignment.align(index, &limb, &parent, here),
-            (None, Part::Head) if joint.name.contains("Neck") => match alignment.bones(index) {
-                Some((ours, theirs)) => {
-                    Aligned { turned: DQuat::from_rotation_arc(trunk * ours, theirs) * trunk, ..here }
-                }
-                None => here,
-            },
-            (None, Part::Torso | Part::Head) => here,
-            (None, _) => Aligned { source: here.source, ..parent },
+        aligned.push(match alignment.bone(&joint.name, index) {
+            Some(bone) if source[index].is_some() && (is_odd || alignment.is_odd(index, &bone, &parent, turned)) => {
+                alignment.align_by_motion(index, &bone, &parent, here, trunk)
+            }
+            Some(bone) => alignment.align(index, &bone, &parent, here),
+            None if parts[index] == Part::Torso && !is_odd => here,
+            None => Aligned { source: here.source, ..parent },
         });
     }
     joints.iter().zip(&aligned).map(|(joint, aligned)| aligned.turned * joint.bind_rotation()).collect()
@@ -81,8 +91,8 @@ impl Alignment<'_> {
         Some([self.origins[joint], self.clip.origins[self.source[joint]?]])
     }
 
-    /// Returns the rotation from our trunk to the source's at rest; `None` where joints are missing or coincide.
-    fn trunk(&self) -> Option<DQuat> {
+    /// Returns the rotations of both trunks at rest; `None` where joints are missing or coincide.
+    fn trunk(&self) -> Option<Trunk> {
         let between = |from: &str, to: &str| {
             let (from, to) = (self.places(from)?, self.places(to)?);
             Some([to[0] - from[0], to[1] - from[1]])
@@ -96,31 +106,33 @@ impl Alignment<'_> {
                 let y = up[side].try_normalize()?;
                 let x = across[side].try_normalize()?;
                 let x = (x - y * y.dot(x)).try_normalize().filter(|_| x.cross(y).length() > 0.3)?;
-                Some(DMat3::from_cols(x, y, x.cross(y)))
+                Some(DQuat::from_mat3(&DMat3::from_cols(x, y, x.cross(y))).normalize())
             };
-            Some(DQuat::from_mat3(&(frame(1)? * frame(0)?.transpose())).normalize())
+            Some(Trunk { ours: frame(0)?, theirs: frame(1)? })
         };
         let hips = between("RightUpLeg", "LeftUpLeg").and_then(frames);
         hips.or_else(|| between("RightArm", "LeftArm").and_then(frames))
     }
 
-    /// Describes a joint of the limbs by its name in our skeleton.
-    fn limb(&self, name: &str, index: usize) -> Option<Limb> {
+    /// Describes a joint by its name in our skeleton; `None` for hips, hands and others.
+    fn bone(&self, name: &str, index: usize) -> Option<Bone> {
         let (side, name) = match (name.strip_prefix("Left"), name.strip_prefix("Right")) {
             (Some(name), _) => (DVec3::X, name),
             (_, Some(name)) => (DVec3::NEG_X, name),
-            _ => return None,
+            _ => (DVec3::ZERO, name),
         };
         let (along, across, follows) = match name {
+            "LowerBack" | "Spine" | "Spine1" | "Head" => (DVec3::Y, DVec3::X, false),
+            "Neck" | "Neck1" => (DVec3::Y, DVec3::X, true),
             "Shoulder" => (side, DVec3::Z, false),
             "Arm" | "ForeArm" => (side, DVec3::Z, true),
             "UpLeg" | "Leg" => (DVec3::NEG_Y, DVec3::X, true),
             // Rigs differ in the slope of the foot's bone; ours stands for theirs.
-            "Foot" => (self.bone(index).unwrap_or(DVec3::Z), DVec3::X, true),
+            "Foot" => (self.direction(index).unwrap_or(DVec3::Z), DVec3::X, true),
             "ToeBase" => (DVec3::Z, DVec3::X, false),
             _ => return None,
         };
-        Some(Limb { along, across, follows })
+        Some(Bone { along, across, follows })
     }
 
     /// Returns the next joint below that drives another joint than this one.
@@ -134,7 +146,7 @@ impl Alignment<'_> {
         })
     }
 
-    fn bone(&self, index: usize) -> Option<DVec3> {
+    fn direction(&self, index: usize) -> Option<DVec3> {
         let below = self.next(index).or_else(|| self.skeleton.children(index).next())?;
         (self.origins[below] - self.origins[index]).try_normalize()
     }
@@ -146,49 +158,66 @@ impl Alignment<'_> {
         Some(((self.origins[next] - self.origins[index]).try_normalize()?, theirs.try_normalize()?))
     }
 
-    /// Aligns a joint of a limb; `here` has the trunk's rotations.
-    fn align(&self, index: usize, limb: &Limb, parent: &Aligned, here: Aligned) -> Aligned {
-        let trunk = here.turned;
-        let bones = self.bones(index);
-        let odd = match bones {
-            Some((ours, theirs)) => (trunk * ours).angle_between(theirs) > FARTHEST,
-            None => parent.odd_bone.is_some(),
-        };
-        if !odd || self.source[index].is_none() {
-            return match bones {
-                _ if !limb.follows => here,
-                Some((ours, theirs)) => {
-                    Aligned { turned: DQuat::from_rotation_arc(trunk * ours, theirs) * trunk, ..here }
-                }
-                None if limb.across == DVec3::X && limb.along != DVec3::NEG_Y => here,
-                None => Aligned { source: here.source, ..*parent },
-            };
+    /// Returns whether the bones of both rest poses point apart.
+    fn is_far(&self, index: usize, trunk: DQuat) -> bool {
+        self.bones(index).is_some_and(|(ours, theirs)| (trunk * ours).angle_between(theirs) > FARTHEST)
+    }
+
+    /// Returns whether a joint of a limb does not rest as a person's.
+    fn is_odd(&self, index: usize, bone: &Bone, parent: &Aligned, trunk: DQuat) -> bool {
+        let is_end = self.bones(index).is_none();
+        bone.along != DVec3::Y && (self.is_far(index, trunk) || is_end && parent.odd_bone.is_some())
+    }
+
+    /// Aligns a joint to the source's rest pose; `here` has the trunk's rotations.
+    fn align(&self, index: usize, bone: &Bone, parent: &Aligned, here: Aligned) -> Aligned {
+        match self.bones(index) {
+            _ if !bone.follows => here,
+            Some((ours, theirs)) => {
+                let trunk = here.turned;
+                Aligned { turned: DQuat::from_rotation_arc(trunk * ours, theirs) * trunk, ..here }
+            }
+            // Feet without toes, and a neck without a head.
+            None if bone.across == DVec3::X && bone.along != DVec3::NEG_Y => here,
+            None => Aligned { source: here.source, ..*parent },
         }
+    }
+
+    /// Aligns a joint whose source does not rest in the pose of a person.
+    fn align_by_motion(&self, index: usize, bone: &Bone, parent: &Aligned, here: Aligned, trunk: Trunk) -> Aligned {
+        let bones = self.bones(index);
         // A joint at the end of a straight limb goes on in its direction.
-        let theirs = bones.map(|(_, theirs)| theirs).or(parent.odd_bone).unwrap_or(DVec3::X);
-        let from_t_pose = self.quarter_turn(limb, theirs, parent, here.source);
+        let theirs = bones.map(|(_, theirs)| theirs).or(parent.odd_bone).unwrap_or(trunk.theirs * DVec3::Y);
+        let from_t_pose = self.quarter_turn(index, bone, theirs, parent);
         let turned = match bones {
-            Some((ours, _)) if limb.follows => from_t_pose * DQuat::from_rotation_arc(ours, limb.along),
+            Some((ours, _)) if bone.follows => from_t_pose * DQuat::from_rotation_arc(ours, bone.along),
+            _ if bone.along == DVec3::Y => from_t_pose * trunk.ours.inverse(),
             _ => from_t_pose,
         };
-        Aligned { turned, from_t_pose, odd_bone: Some(theirs), ..here }
+        Aligned { turned: turned.normalize(), from_t_pose, odd_bone: Some(theirs), ..here }
     }
 
     /// Returns the rotation from a T pose to the source's rest that maps the bone to `theirs` and an axis to an axis, and twists
-    /// the joint least against its parent over the clip.
-    fn quarter_turn(&self, limb: &Limb, theirs: DVec3, parent: &Aligned, source: usize) -> DQuat {
-        let across = (limb.across - limb.along * limb.along.dot(limb.across)).normalize_or(limb.across);
-        let ours = DMat3::from_cols(limb.along, across, limb.along.cross(across));
+    /// the joint least against its parent over the clip. An elbow bends to the front of a T pose.
+    fn quarter_turn(&self, index: usize, bone: &Bone, theirs: DVec3, parent: &Aligned) -> DQuat {
+        let across = (bone.across - bone.along * bone.along.dot(bone.across)).normalize_or(bone.across);
+        let ours = DMat3::from_cols(bone.along, across, bone.along.cross(across));
         let axes = [DVec3::X, DVec3::Y, DVec3::Z, DVec3::NEG_X, DVec3::NEG_Y, DVec3::NEG_Z];
         let upright = axes.into_iter().filter_map(|axis| {
             let axis = axis - theirs * theirs.dot(axis);
             (axis.length() > 0.7).then(|| axis.normalize())
         });
+        let source = self.source[index].unwrap_or(parent.source);
+        let is_arm = ["LeftArm", "RightArm"].contains(&self.skeleton.joints()[index].name.as_str());
+        let below = self.next(index).filter(|_| is_arm);
+        let below = below.and_then(|below| Some((self.source[below]?, self.bones(below)?.1)));
         let agreement = |axis: DVec3| -> f64 {
             let frames = self.clip.spread_frames(FRAMES).map(|joints| {
                 let above = joints[parent.source].turned * parent.from_t_pose;
-                let arc = DQuat::from_rotation_arc(above * limb.along, joints[source].turned * theirs);
-                (arc * above * across).dot(joints[source].turned * axis)
+                let (limb, axis) = (joints[source].turned * theirs, joints[source].turned * axis);
+                let least = DQuat::from_rotation_arc(above * bone.along, limb) * above * across;
+                let bend = below.map_or(0.0, |(below, theirs)| axis.dot(joints[below].turned * theirs));
+                least.dot(axis) + BEND * bend
             });
             frames.sum()
         };

@@ -67,6 +67,8 @@ struct Form<'a> {
 enum Rest {
     T,
     Along(DVec3),
+    /// Bones along x, those of the right side backwards, and the spine turned against the hips: a rig that was mirrored.
+    Mirrored,
     /// Feet pointing down, as at rest of some rigs.
     Ballet,
 }
@@ -132,6 +134,17 @@ impl Form<'_> {
     /// Returns the axes of a joint, T pose, in which its rotation is zero at rest.
     fn joint_axes(&self, joint: &str) -> DMat3 {
         match self.rest {
+            Rest::Mirrored => {
+                let along = Self { rest: Rest::Along(DVec3::X), ..Self::default() }.joint_axes(joint);
+                let quarter = 90f64.to_radians();
+                if joint.starts_with("Right") && joint != "RightShoulder" {
+                    along * DMat3::from_rotation_z(2.0 * quarter)
+                } else if joint == "Hips" || joint.contains("Leg") {
+                    along
+                } else {
+                    along * DMat3::from_rotation_x(quarter)
+                }
+            }
             Rest::Along(axis) => {
                 let bone = (tip(joint) - place(joint)).normalize();
                 let up = if bone.z.abs() < 0.9 { DVec3::Z } else { DVec3::Y };
@@ -241,6 +254,8 @@ fn a_rest_pose_with_all_bones_along_an_axis_gives_the_same_motion() {
             assert_same(&skeleton, &usual, &odd.track(&skeleton), 0.015, &format!("along {axis}, six {six}"));
         }
     }
+    let mirrored = Form { rest: Rest::Mirrored, ..Form::default() };
+    assert_same(&skeleton, &usual, &mirrored.track(&skeleton), 0.015, "mirrored");
 }
 
 #[test]
