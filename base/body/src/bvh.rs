@@ -126,8 +126,9 @@ pub fn parse_bvh(text: &str, path: &Path) -> Result<BvhClip, BodyError> {
                 open.push(joints.len());
                 joints.push(child);
             }
-            "END" => {
-                words.expect("SITE")?;
+            "END" | "ENDSITE" => {
+                // "Site", or a name of another program.
+                words.rest = words.rest.find('{').map_or("", |brace| &words.rest[brace..]);
                 words.expect("{")?;
                 words.expect("OFFSET")?;
                 joints[current].end_site = Some(words.vector()?);

@@ -262,9 +262,10 @@ fn plain_names(foreign: &[Named<'_>]) -> Vec<String> {
 fn words(name: &str) -> Vec<String> {
     let name = name.rsplit([':', '|']).next().unwrap_or(name);
     // Second Life: "mHipLeft".
-    let name = name.strip_prefix('m').filter(|rest| rest.starts_with(char::is_uppercase)).unwrap_or(name);
-    let words = name.split(|c: char| !c.is_alphanumeric()).filter(|word| !word.is_empty());
-    words.map(str::to_lowercase).collect()
+    let plain = |word: &str| {
+        word.strip_prefix('m').filter(|rest| rest.starts_with(char::is_uppercase)).unwrap_or(word).to_lowercase()
+    };
+    name.split(|c: char| !c.is_alphanumeric()).filter(|word| !word.is_empty()).map(plain).collect()
 }
 
 fn plain(name: &str) -> String {

@@ -503,6 +503,8 @@ fn text_of_other_editors_is_read() {
     same(&text.replace("Frames: 6", "Frames :\t6"), "a space before the colon");
     same(&text.replace("Frames: 6", "Frames 6"), "no colon");
     same(&text.replace("LeftUpLeg\n\t{", "LeftUpLeg {"), "a brace on the name's line");
+    same(&text.replace("End Site", "End Site_of_hand"), "a named end");
+    same(&text.replace("End Site", "EndSite"), "an end in one word");
     let folder = tempfile::tempdir().unwrap();
     let path = folder.path().join("test.bvh");
     let wide = |mark: [u8; 2], bytes: fn(u16) -> [u8; 2]| -> Vec<u8> {
