@@ -30,6 +30,7 @@ mod print;
 mod projection;
 mod rig;
 mod start;
+mod storage_xml;
 #[doc(hidden)]
 pub mod testing;
 mod uncertainty;

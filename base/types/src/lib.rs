@@ -25,6 +25,7 @@ mod pose;
 mod rendered_view;
 mod restarts;
 mod supervised;
+mod text_file;
 mod whole_file;
 
 pub use camera::{Camera, CameraError, Intrinsics, Lens, MAX_IMAGE_SIDE, Rig};
@@ -41,4 +42,5 @@ pub use pose::{Pose, PoseError, PoseTrack};
 pub use rendered_view::RenderedView;
 pub use restarts::Restarts;
 pub use supervised::{SupervisedThread, ThreadHealth, ThreadWatch};
+pub use text_file::{decode_text, read_text, read_text_up_to};
 pub use whole_file::write_whole;
