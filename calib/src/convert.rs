@@ -113,6 +113,11 @@ impl Format {
     pub fn detect(path: &Path) -> Option<Self> {
         let has = |name: &str| path.join(name).is_file();
         let text = |path: &Path| calibration_file::read(path).unwrap_or_default();
+        let storage = |text: &str| match () {
+            () if kalibr::is_chain(text) => Some(Self::Kalibr),
+            () if opencv::is_storage(text) => Some(Self::OpenCv),
+            () => None,
+        };
         if path.is_dir() {
             let of_folder = [
                 (calibration_file::FILE, Self::Flyrig),
@@ -131,13 +136,20 @@ impl Format {
                 [(".cameramodel", Self::Mrcal), (".qca.txt", Self::Qualisys)].into_iter().find_map(found)
             };
             let of_storage = || {
-                let file = opencv::ENDINGS.into_iter().find_map(first)?;
-                Self::detect(&file).filter(|format| matches!(format, Self::Kalibr | Self::OpenCv))
+                let formats = |ending: &str| {
+                    let formats = files_with(path, ending).ok()?.into_iter().map(|file| storage(&text(&file)));
+                    // Others that end so are rare.
+                    formats
+                        .flatten()
+                        .next()
+                        .or_else(|| first(ending).filter(|_| ending == ".yml").map(|_| Self::OpenCv))
+                };
+                opencv::ENDINGS.into_iter().find_map(formats)
             };
             return named.or_else(model).or_else(by_ending).or_else(of_storage);
         }
         let name = path.file_name()?.to_string_lossy().to_lowercase();
-        let storage_or = |other: Self| if opencv::is_storage(&text(path)) { Self::OpenCv } else { other };
+        let storage_or = |other: Self| storage(&text(path)).unwrap_or(other);
         match name.as_str() {
             calibration_file::FILE if text(path).contains("[[cameras]]") => Some(Self::Flyrig),
             "intri.yml" | "extri.yml" => Some(Self::EasyMocap),
@@ -147,9 +159,7 @@ impl Format {
             name if name.ends_with(".xml") => Some(storage_or(Self::Qualisys)),
             name if name.ends_with(".json") => Some(storage_or(Self::Nerfstudio)),
             name if name.ends_with(".toml") => Some(Self::Anipose),
-            name if name.ends_with(".yaml") || name.ends_with(".yml") => {
-                Some(if kalibr::is_chain(&text(path)) { Self::Kalibr } else { Self::OpenCv })
-            }
+            name if name.ends_with(".yaml") || name.ends_with(".yml") => Some(storage_or(Self::OpenCv)),
             _ => None,
         }
     }
@@ -248,7 +258,8 @@ fn kalibr_file(path: &Path) -> Result<PathBuf, CalibError> {
         return Ok(known);
     }
     let is_chain = |file: &PathBuf| calibration_file::read(file).is_ok_and(|text| kalibr::is_chain(&text));
-    let mut chains = files_with(path, ".yaml")?.into_iter().filter(is_chain);
+    let files = [files_with(path, ".yaml")?, files_with(path, ".yml")?].concat();
+    let mut chains = files.into_iter().filter(is_chain);
     match (chains.next(), chains.next()) {
         (Some(file), None) => Ok(file),
         (Some(_), Some(_)) => Err(bad(path, "holds several camera chains; name one")),

@@ -247,7 +247,15 @@ impl YamlFile {
     }
 
     fn parse(text: &str) -> Result<Map, String> {
-        let root = if text.trim_start().starts_with('<') { storage_xml::parse(text)? } else { parse(text)? };
+        let root = match text.trim_start().chars().next() {
+            Some('<') => storage_xml::parse(text)?,
+            // OpenCV puts comments into JSON, each on a line of its own.
+            Some('{') => {
+                let lines = text.lines().map(|line| if line.trim_start().starts_with("//") { "" } else { line });
+                parse(&lines.collect::<Vec<_>>().join("\n"))?
+            }
+            _ => parse(text)?,
+        };
         if root.is_empty() { Err("no keys in it".to_owned()) } else { Ok(root) }
     }
 

@@ -67,6 +67,12 @@ fn camera(path: &Path, image_size: &dyn Fn(&CameraId) -> Option<(u32, u32)>) -> 
     };
     let missing =
         |key: &str| bad(path, format!("{key} is missing; export the camera again with OpenCV's calibration sample"));
+    if file.key(&["M1"]).is_some() {
+        return Err(bad(
+            path,
+            "holds a stereo pair (M1, D1, M2, D2); write one file for each camera, with rvec and tvec",
+        ));
+    }
     let k = first(&MATRIX)?.ok_or_else(|| missing("camera_matrix"))?;
     let (focal, center) = camera_matrix(&k.values).map_err(|problem| bad(path, format!("camera_matrix {problem}")))?;
     let d = first(&COEFFICIENTS)?.ok_or_else(|| missing("distortion_coefficients"))?;
