@@ -113,16 +113,17 @@ impl Format {
     pub fn detect(path: &Path) -> Option<Self> {
         let has = |name: &str| path.join(name).is_file();
         let text = |path: &Path| calibration_file::read(path).unwrap_or_default();
-        let storage = |text: &str| match () {
-            () if kalibr::is_chain(text) => Some(Self::Kalibr),
-            () if opencv::is_storage(text) => Some(Self::OpenCv),
-            () => None,
+        let storage = |text: &str| {
+            let is_chain = kalibr::is_chain(text);
+            is_chain.then_some(Self::Kalibr).or_else(|| opencv::is_storage(text).then_some(Self::OpenCv))
         };
         if path.is_dir() {
             let of_folder = [
                 (calibration_file::FILE, Self::Flyrig),
                 ("intri.yml", Self::EasyMocap),
                 (kalibr::FILE, Self::Kalibr),
+                (colmap::CAMERAS, Self::Colmap),
+                (colmap_binary::CAMERAS, Self::Colmap),
                 (nerfstudio::FILE, Self::Nerfstudio),
                 (anipose::FILE, Self::Anipose),
                 ("camera_array.toml", Self::Anipose),

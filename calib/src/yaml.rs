@@ -114,8 +114,8 @@ struct Open {
 
 enum Content {
     List(Vec<Value>),
-    /// Entries, and the key that waits for its value.
-    Map(Map, Option<String>),
+    /// Entries, the key that waits for its value, and the values of merge keys.
+    Map(Map, Option<String>, Vec<Value>),
 }
 
 /// Tree under construction.
@@ -143,12 +143,15 @@ impl Tree {
                 self.close(value, 0, before)
             }
             Event::SequenceStart(anchor, _) => self.open(anchor, Content::List(Vec::new())),
-            Event::MappingStart(anchor, _) => self.open(anchor, Content::Map(Map::new(), None)),
+            Event::MappingStart(anchor, _) => self.open(anchor, Content::Map(Map::new(), None, Vec::new())),
             Event::SequenceEnd | Event::MappingEnd => {
                 let Some(Open { anchor, nodes_before, content }) = self.open.pop() else { return Ok(()) };
                 let value = match content {
                     Content::List(values) => Value::List(values),
-                    Content::Map(entries, _) => Value::Map(entries),
+                    Content::Map(mut entries, _, merged) => {
+                        merged.into_iter().try_for_each(|value| merge(&mut entries, value))?;
+                        Value::Map(entries)
+                    }
                 };
                 self.close(value, anchor, nodes_before)
             }
@@ -194,10 +197,10 @@ impl Tree {
         };
         match &mut around.content {
             Content::List(values) => values.push(value),
-            Content::Map(entries, waiting) => match (waiting.take(), value) {
+            Content::Map(entries, waiting, merged) => match (waiting.take(), value) {
                 (None, Value::Scalar(key, _)) => *waiting = Some(key),
                 (None, _) => return Err("a key that is a list or a map".to_owned()),
-                (Some(key), value) if key == "<<" => merge(entries, value)?,
+                (Some(key), value) if key == "<<" => merged.push(value),
                 (Some(key), value) => put(entries, key, value)?,
             },
         }

@@ -63,7 +63,7 @@ fn every_key_of_a_lens_in_transforms_is_heeded_or_named() {
         (r#", "distortion_params": [1]"#, "\"distortion_params\" is not understood"),
         (r#", "camera_convention": "opencv""#, "\"camera_convention\" is not understood"),
         (r#", "k1": "a lot""#, "k1 is missing or no number"),
-        (r#", "transform_matrix_end": [[1]]"#, "transform_matrix_end differs"),
+        (r#", "is_fisheye": true, "transform_matrix_end": [[1]]"#, "transform_matrix_end differs"),
     ] {
         refused(Format::Nerfstudio, "transforms.json", &of_frame(more), &[word]);
     }
