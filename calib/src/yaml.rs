@@ -16,7 +16,7 @@ use crate::error::CalibError;
 use crate::storage_xml;
 
 /// Most nodes of a file, copies by aliases included: a calibration with its corners has some ten thousand.
-const MAX_NODES: usize = 1_000_000;
+const MAX_NODES: usize = 500_000;
 /// Most levels of nested lists and maps.
 pub(crate) const MAX_DEPTH: usize = 32;
 
@@ -96,6 +96,9 @@ fn parse(text: &str) -> Result<Map, String> {
     let body = body.map_or("", |from| &text[from..]);
     let skipped = text[..text.len() - body.len()].matches('\n').count();
     let mut tree = Tree::default();
+    // The parser looks ahead to the end of a list in brackets: their entries are counted before.
+    tree.count(body.bytes().filter(|byte| matches!(byte, b',' | b'[' | b'{')).count())?;
+    tree.nodes = 0;
     for event in Parser::new_from_str(body) {
         let place = |line: usize, problem: &str| format!("line {}: {problem}", skipped + line);
         let (event, span): (Event<'_>, Span) =

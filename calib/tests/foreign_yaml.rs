@@ -130,11 +130,13 @@ fn yaml_that_would_fill_the_memory_is_refused_at_once() {
     });
     for (text, word) in [
         (laughs, "values; this is no calibration"),
-        ("cam0: ".to_owned() + &"[".repeat(1_000_000), "deep"),
-        ("cam0: ".to_owned() + &"{a: ".repeat(200_000), "deep"),
+        ("cam0: ".to_owned() + &"[".repeat(400_000), "line 1: "),
+        ("cam0: ".to_owned() + &"{a: ".repeat(200_000), "line 1: "),
         ((0..20_000).map(|depth| " ".repeat(depth.min(200)) + "- \n").collect(), "YAML"),
         ("cam0: &a [*a]\n".to_owned(), "line 1"),
         ("cam0: [".to_owned() + &"1,".repeat(3_000_000) + "]", "values; this is no calibration"),
+        ("cam0:\n".to_owned() + &"- 1\n".repeat(1_000_000), "values; this is no calibration"),
+        ("cam0:\n".to_owned() + &"- ".repeat(1_000_000), "deep"),
     ] {
         let begin = std::time::Instant::now();
         refused(Format::Kalibr, "camchain.yaml", &text, &[word]);
