@@ -6,6 +6,7 @@
 mod anipose;
 mod colmap;
 mod colmap_binary;
+mod colmap_models;
 mod image_names;
 pub(crate) mod imported;
 mod kalibr;

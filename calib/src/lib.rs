@@ -36,6 +36,7 @@ pub mod testing;
 mod uncertainty;
 mod watch;
 mod yaml;
+mod yaml_value;
 
 pub use board::{Board, Pattern};
 pub use bundle::{BoardShot, BoardView};

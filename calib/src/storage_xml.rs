@@ -2,7 +2,7 @@
 
 use roxmltree::{Document, Node};
 
-use crate::yaml::{MAX_DEPTH, Map, Value};
+use crate::yaml_value::{MAX_DEPTH, Map, Value};
 
 /// Parses a file `<opencv_storage>`.
 pub(crate) fn parse(text: &str) -> Result<Map, String> {

@@ -10,7 +10,7 @@ use std::{
 use flyrig_types::{Intrinsics, Rig};
 
 use super::{
-    colmap::{MODELS, lens, model, named, pose, shot},
+    colmap_models::{MODELS, lens, model, named, pose, shot},
     image_names::Shot,
     imported::ImportedCamera,
     shared::bad,

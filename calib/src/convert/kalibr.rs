@@ -14,7 +14,8 @@ use super::{
     shared::{bad, intrinsics, motion_of, named_lens, refuse_unknown, rows4},
 };
 use crate::error::CalibError;
-use crate::yaml::{Map, Value, parse_tree};
+use crate::yaml::parse_tree;
+use crate::yaml_value::{Map, Value};
 
 pub(super) const FILE: &str = "camchain.yaml";
 /// Keys of a camera that are understood, or change nothing.

@@ -11,8 +11,9 @@ use serde_json::{Map, Value, json};
 use super::{
     image_names::{Shot, name_cameras},
     imported::{Imported, ImportedCamera},
-    shared::{bad, intrinsics, json, motion_of, opencv_lens, refuse_unknown, rows4},
+    shared::{bad, intrinsics, motion_of, opencv_lens, refuse_unknown, rows4},
 };
+use crate::calibration_file;
 use crate::error::CalibError;
 
 pub(super) const FILE: &str = "transforms.json";
@@ -51,7 +52,9 @@ pub(super) fn flip() -> DQuat {
 }
 
 pub(super) fn read(path: &Path, image_size: &dyn Fn(&CameraId) -> Option<(u32, u32)>) -> Result<Imported, CalibError> {
-    let root = json(path)?;
+    let text = calibration_file::read(path)?;
+    let root: Value =
+        serde_json::from_str(&text).map_err(|error| bad(path, format!("is no JSON: {error}; export it again")))?;
     let frames = root
         .get("frames")
         .and_then(Value::as_array)

@@ -4,9 +4,7 @@ use std::path::{Path, PathBuf};
 
 use flyrig_types::{Intrinsics, Isometry, Lens};
 use glam::{DMat3, DQuat, DVec2, DVec3};
-use serde_json::Value;
 
-use crate::calibration_file;
 use crate::error::CalibError;
 
 /// Largest entry of `RᵀR - 1` that is attributed to rounding in a text file.
@@ -110,12 +108,6 @@ pub(crate) fn refuse_unknown<'a>(keys: impl IntoIterator<Item = &'a str>, known:
         )),
         None => Ok(()),
     }
-}
-
-/// Reads a JSON file.
-pub(super) fn json(path: &Path) -> Result<Value, CalibError> {
-    let text = calibration_file::read(path)?;
-    serde_json::from_str(&text).map_err(|error| bad(path, format!("is no JSON: {error}; export it again")))
 }
 
 /// Reads a rotation matrix; the error text describes its fault.
