@@ -3,7 +3,7 @@
 
 mod support;
 
-use std::fs;
+use std::{fs, path::Path};
 
 use flyrig_calib::Format;
 use flyrig_types::{Lens, Rig};
@@ -259,6 +259,24 @@ fn damaged_models_are_named_whatever_they_promise() {
     let huge = with(&cameras, 16, &u64::MAX.to_le_bytes());
     let error = read(Format::Colmap, &[("cameras.bin", &huge), ("images.bin", &images)]).unwrap_err();
     assert!(error.contains("image width"), "{error}");
+    // Whatever else changes, the result is an error or valid cameras.
+    let mut state = 1u64;
+    let mut random = move |most: usize| {
+        state = state.wrapping_mul(6_364_136_223_846_793_005).wrapping_add(1_442_695_040_888_963_407);
+        (state >> 33) as usize % most
+    };
+    for _ in 0..1000 {
+        let mut files = [cameras.clone(), images.clone()];
+        for _ in 0..1 + random(3) {
+            let file = &mut files[random(2)];
+            let at = random(file.len());
+            file[at] = u8::try_from(random(256)).unwrap();
+        }
+        if let Ok(imported) = read(Format::Colmap, &[("cameras.bin", &files[0]), ("images.bin", &files[1])]) {
+            let rig = imported.rig(Path::new("x")).unwrap().unwrap();
+            assert!(rig.cameras.iter().all(|camera| camera.validate().is_ok()));
+        }
+    }
     // Text whose images have no lines of points would lose every second camera.
     let lens = "1 PINHOLE 640 480 500 500 320 240\n";
     let missing = "1 1 0 0 0 0 0 0 1 a.png\n2 1 0 0 0 0 0 1 1 b.png\n";
