@@ -18,6 +18,7 @@ use crate::yaml_value::{MAX_DEPTH, Map, Value};
 
 /// Most nodes of a file, copies by aliases included: a calibration with its corners has some ten thousand.
 const MAX_NODES: usize = 500_000;
+
 /// Matrix of a file, row by row.
 #[derive(Debug, Clone, PartialEq)]
 pub(crate) struct Matrix {

@@ -3,7 +3,7 @@
 //! Programs that calibrate from images know no cameras, only images: one folder a camera, one folder for the images of all cameras,
 //! or one folder an instant. The path tells which, together with the poses: a camera has one.
 
-use std::collections::BTreeMap;
+use std::collections::{BTreeMap, BTreeSet};
 
 use flyrig_types::CameraId;
 
@@ -113,8 +113,8 @@ fn chosen(shots: &[Shot], names: &[String]) -> Result<Vec<usize>, String> {
 fn are_cameras(shots: &[Shot], paths: &[Vec<&str>]) -> bool {
     let folder = |path: &Vec<&str>| name(path, 1).unwrap_or_default();
     let stem = |path: &Vec<&str>| name(path, 0).unwrap_or_default();
-    let folders: std::collections::BTreeSet<String> = paths.iter().map(folder).collect();
-    let stems: std::collections::BTreeSet<String> = paths.iter().map(stem).collect();
+    let folders: BTreeSet<String> = paths.iter().map(folder).collect();
+    let stems: BTreeSet<String> = paths.iter().map(stem).collect();
     if folders.len() > 1 {
         return stems.len() < shots.len();
     }

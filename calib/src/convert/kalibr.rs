@@ -4,7 +4,11 @@
 //! Kalibr numbers its cameras; their names are read from and written to `rostopic`. `timeshift_cam_imu` gives time
 //! offsets: `t_imu = t_cam + shift`.
 
-use std::{collections::BTreeMap, fmt::Write as _, path::Path};
+use std::{
+    collections::{BTreeMap, BTreeSet},
+    fmt::Write as _,
+    path::Path,
+};
 
 use flyrig_types::{CameraId, Isometry, Lens, Rig};
 use glam::DVec2;
@@ -84,7 +88,7 @@ fn names(topics: &[&str]) -> Vec<String> {
     let parts: Vec<Vec<&str>> =
         topics.iter().map(|topic| topic.split('/').filter(|part| !part.is_empty()).collect()).collect();
     let distinct = |names: &[String]| {
-        let sorted: std::collections::BTreeSet<&String> = names.iter().collect();
+        let sorted: BTreeSet<&String> = names.iter().collect();
         sorted.len() == names.len() && names.iter().all(|name| !name.is_empty())
     };
     let most = parts.iter().map(Vec::len).max().unwrap_or(0);
