@@ -145,7 +145,7 @@ impl Config {
     /// # Errors
     /// Those of [`Self::load`].
     pub fn load_for_capture(path: &Path) -> Result<Self> {
-        let text = std::fs::read_to_string(path)
+        let text = flyrig_types::read_text(path)
             .with_context(|| format!("cannot read the configuration {}", path.display()))?;
         let mut config = Self::parse_values(&text).with_context(|| in_file(path))?;
         if config.source.kind != SourceKind::Cameras {

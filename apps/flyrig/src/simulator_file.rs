@@ -16,7 +16,7 @@ pub const DEFAULT_TOML: &str = include_str!("../assets/sim.toml");
 /// Names the file, the key, its value and what is expected.
 pub fn load(path: &Path) -> Result<SimConfig> {
     let in_file = || format!("in the simulator's configuration {}", path.display());
-    let text = std::fs::read_to_string(path)
+    let text = flyrig_types::read_text(path)
         .with_context(|| format!("cannot read the simulator's configuration {}", path.display()))?;
     parse(&text).with_context(in_file)
 }

@@ -16,6 +16,8 @@ pub struct Imported {
     pub cameras: Vec<ImportedCamera>,
     /// Unit vector against gravity, world axes, where the format contains it.
     pub up: Option<DVec3>,
+    /// Statements of the file that flyrig cannot represent and that change no lens or pose, for the user.
+    pub warnings: Vec<String>,
 }
 
 /// Camera whose pose may be unknown.
@@ -34,6 +36,11 @@ pub struct ImportedCamera {
 }
 
 impl ImportedCamera {
+    /// Creates a camera whose name is set later.
+    pub(super) fn unnamed(intrinsics: Intrinsics, pose: Option<Isometry>) -> Self {
+        Self { id: CameraId::from(""), intrinsics, pose, time_offset_nanos: 0, color: ColorMatch::NONE }
+    }
+
     pub(super) fn scale(&mut self, scale: f64) {
         if let Some(pose) = &mut self.pose {
             pose.translation *= scale;
@@ -58,6 +65,10 @@ impl ImportedCamera {
 }
 
 impl Imported {
+    pub(crate) fn new(cameras: Vec<ImportedCamera>, up: Option<DVec3>) -> Self {
+        Self { cameras, up, warnings: Vec::new() }
+    }
+
     /// Returns the rig, with an estimate of the up direction where the file lacks it; `None` where no camera has a
     /// pose.
     ///

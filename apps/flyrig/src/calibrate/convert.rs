@@ -78,6 +78,9 @@ pub fn convert(args: &CalibrateConvertArgs) -> Result<()> {
         .with_context(|| format!("cannot create {}", args.target.out.display()))?;
     println!("from {}: {}", from.name(), from.conventions());
     println!("to {}: {}", args.to.name(), args.to.conventions());
+    for warning in &imported.warnings {
+        println!("warning: {warning}");
+    }
     let Some(mut rig) = rig else {
         if args.to != Format::Flyrig {
             bail!("{} holds lenses without poses; they can be written as flyrig's alone", input.display());
