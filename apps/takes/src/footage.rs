@@ -107,6 +107,9 @@ impl Footage {
                 let open = |(id, file): (CameraId, &PathBuf)| {
                     Ok(boxed(VideoReplay::open(&id, file, &VideoOptions::default())?))
                 };
+                for file in files {
+                    video_camera(file).check().with_context(|| file.display().to_string())?;
+                }
                 let all = files.iter().map(|file| (video_camera(file), file));
                 let sources = match cameras {
                     None => all.map(open).collect::<Result<_>>()?,
