@@ -21,7 +21,7 @@ use crate::{dataset, recorded::recorded_cameras};
 pub enum Footage {
     /// Folder in EasyMocap's layout, with `images/CAM/*`.
     Folder(PathBuf),
-    /// File of `flyrig record`.
+    /// File of `flyrig record`, or MCAP file of another program.
     Recording(PathBuf),
     /// Video files, one per camera, each named after its camera.
     Videos(Vec<PathBuf>),
@@ -96,11 +96,10 @@ impl Footage {
                 Ok(OpenFootage { sources: sources.into_iter().map(boxed).collect(), frames })
             }
             Self::Recording(path) => {
-                let open = |id: &CameraId| Ok(boxed(McapReplay::open(id, path)?));
-                let sources = match cameras {
-                    Some(ids) => ids.iter().map(open).collect::<Result<_>>()?,
-                    None => recorded_cameras(path)?.ids.iter().map(open).collect::<Result<_>>()?,
-                };
+                let recorded = recorded_cameras(path)?;
+                let ids = cameras.unwrap_or(&recorded.ids);
+                let open = |id: &CameraId| Ok(boxed(McapReplay::open_camera(&recorded.images_of(id), path)?));
+                let sources = ids.iter().map(open).collect::<Result<_>>()?;
                 Ok(OpenFootage { sources, frames: 0 })
             }
             Self::Videos(files) => {

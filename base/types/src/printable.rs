@@ -70,11 +70,13 @@ pub fn shorten_values(text: &str) -> Cow<'_, str> {
 /// Returns the position of the quote that ends a value; a backslash hides the character after it.
 fn closing(text: &str, quote: char) -> Option<usize> {
     let mut is_hidden = false;
-    text.char_indices().find(|(_, char)| {
-        let is_end = *char == quote && !is_hidden;
-        is_hidden = *char == '\\' && !is_hidden;
-        is_end
-    }).map(|(at, _)| at)
+    text.char_indices()
+        .find(|(_, char)| {
+            let is_end = *char == quote && !is_hidden;
+            is_hidden = *char == '\\' && !is_hidden;
+            is_end
+        })
+        .map(|(at, _)| at)
 }
 
 /// Escapes a whole text like [`printable`], at any length.

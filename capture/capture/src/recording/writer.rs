@@ -249,7 +249,8 @@ impl<D: Disk> Writing<D> {
     fn run(&mut self, part: RecordingPart<D>, items: &Receiver<Item>) -> McapResult<()> {
         let mut part = Some(part);
         loop {
-            let until_due = if self.unflushed > 0 { CHUNK_TIME.saturating_sub(self.flushed.elapsed()) } else { CHUNK_TIME };
+            let until_due =
+                if self.unflushed > 0 { CHUNK_TIME.saturating_sub(self.flushed.elapsed()) } else { CHUNK_TIME };
             let written = match items.recv_timeout(until_due) {
                 Ok(item) => self.write(&mut part, &item),
                 Err(RecvTimeoutError::Timeout) => Ok(()),
