@@ -79,7 +79,14 @@ impl Footage {
     pub fn load_rig(&self, chosen: &[CameraId]) -> Result<Rig> {
         match self {
             Self::Folder(root) => dataset::load_rig(root, chosen),
-            Self::Recording(path) => recorded_cameras(path)?.calibrated(path),
+            Self::Recording(path) => {
+                let recorded = recorded_cameras(path)?;
+                // The error says what is missing.
+                if recorded.rig.is_some() {
+                    recorded.log_notes(path);
+                }
+                recorded.calibrated(path)
+            }
             Self::Videos(_) => anyhow::bail!("videos have no calibration of their own; name its folder"),
         }
     }

@@ -233,6 +233,38 @@ mod tests {
     }
 
     #[test]
+    fn a_recording_of_another_program_has_a_rig_or_says_what_is_missing() {
+        let place = Isometry::look_at(DVec3::new(0.0, -3.0, 1.0), DVec3::Z, DVec3::Z);
+        let camera = |id: &str, camera_from_world| ForeignCamera {
+            images: RecordedCamera { topic: format!("/{id}/image"), ..RecordedCamera::new(id.into()) },
+            intrinsics: Some(Intrinsics::pinhole(640, 480, 500.0)),
+            camera_from_world,
+        };
+        let found = |pose, up, lacks: Option<&str>| {
+            let cameras = vec![camera("a", Some(place)), camera("b", pose)];
+            from_foreign(
+                "x.mcap".as_ref(),
+                ForeignCameras { cameras, up, lacks: lacks.map(str::to_owned), notes: vec![] },
+            )
+        };
+        let recorded = found(Some(place), Some(DVec3::Z), None).unwrap();
+        assert_eq!(recorded.images_of(&"b".into()).topic, "/b/image");
+        assert_eq!(recorded.images_of(&"c".into()), RecordedCamera::new("c".into()));
+        let rig = recorded.calibrated("x.mcap".as_ref()).unwrap();
+        assert_eq!((rig.cameras[1].camera_from_world, rig.world_up), (place, DVec3::Z));
+        // A world without a known vertical gets that of its cameras.
+        let rig = found(Some(place), None, None).unwrap().rig.unwrap();
+        assert!(rig.world_up.dot(DVec3::Z) > 0.9, "{}", rig.world_up);
+        let recorded = found(None, None, Some("the cameras have no poses")).unwrap();
+        assert_eq!((recorded.lenses.len(), recorded.rig.is_none()), (2, true));
+        let text = recorded.calibrated("x.mcap".as_ref()).unwrap_err().to_string();
+        assert!(
+            text.starts_with("x.mcap: was recorded without a calibration (the cameras have no poses); make"),
+            "{text}"
+        );
+    }
+
+    #[test]
     fn names_that_no_camera_may_have_are_refused_with_the_file() {
         let folder = tempfile::tempdir().unwrap();
         let long = "x".repeat(300);

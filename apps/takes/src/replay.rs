@@ -240,7 +240,6 @@ fn measure_recording(settings: &ReplaySettings, rig: &Rig) -> Result<(f64, usize
     }
     let ids: Vec<CameraId> = rig.cameras.iter().map(|camera| camera.id.clone()).collect();
     let recorded = recorded_cameras(&settings.dataset)?;
-    recorded.log_notes(&settings.dataset);
     let images: Vec<RecordedCamera> = ids.iter().map(|id| recorded.images_of(id)).collect();
     let spans = recorded_spans(&settings.dataset, &images)?;
     let Some(longest) = spans.iter().max_by_key(|span| span.frames).filter(|span| span.frames > 0) else {

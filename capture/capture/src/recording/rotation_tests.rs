@@ -270,6 +270,25 @@ fn what_is_written_becomes_durable_while_it_runs_and_at_the_end_of_every_file() 
     });
 }
 
+/// A killed process loses what is not in the file.
+#[test]
+fn a_frame_is_in_the_file_within_half_a_second() {
+    let memory = Memory::default();
+    let recorder = Recorder::start(memory.clone(), &[note()], &RecorderConfig::default()).unwrap();
+    let mut tap = recorder.tap(Script("a".into(), 0, 1000)).unwrap();
+    let mut delay = |pause_ms: u64| {
+        std::thread::sleep(Duration::from_millis(pause_ms));
+        let (before, start) = (memory.with(|files| files.files[0].len()), Instant::now());
+        assert!(tap.next_frame(Duration::ZERO).is_ok());
+        memory.until("a frame is written", |files| files.files[0].len() > before);
+        start.elapsed()
+    };
+    // The median, since the machine may be busy.
+    let mut delays: Vec<Duration> = [10, 120, 230, 340, 450, 560, 670].map(&mut delay).into();
+    delays.sort();
+    assert!(delays[3] < Duration::from_millis(450), "{delays:?}");
+}
+
 #[test]
 fn nothing_is_recorded_without_the_reserve() {
     let folder = tempfile::tempdir().unwrap();

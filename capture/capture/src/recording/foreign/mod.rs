@@ -73,19 +73,24 @@ pub fn foreign_cameras(path: &Path) -> Result<ForeignCameras, CaptureError> {
 struct Times {
     first: i64,
     last: i64,
-    /// Whether every time was later than the one before, and none was 0.
-    is_increasing: bool,
+    /// Messages whose time was not later than the one before, or was missing.
+    disordered: usize,
 }
 
 impl Times {
     fn add(times: &mut Option<Self>, nanos: i64) {
-        match times {
-            None => *times = Some(Self { first: nanos, last: nanos, is_increasing: nanos > 0 }),
-            Some(times) => {
-                times.is_increasing &= nanos > times.last;
-                times.last = nanos;
-            }
+        let times = times.get_or_insert(Self { first: nanos, last: i64::MIN, disordered: 0 });
+        if nanos > times.last && nanos > 0 {
+            times.first = if times.last == i64::MIN { nanos } else { times.first };
+            times.last = nanos;
+        } else {
+            times.disordered += 1;
         }
+    }
+
+    /// Returns whether frames can have these times: all but one in a hundred, which are left out.
+    fn are_usable(&self, frames: usize) -> bool {
+        self.disordered * 100 <= frames
     }
 }
 
@@ -346,7 +351,7 @@ fn times(chosen: &[Chosen<'_>], notes: &mut Vec<String>) -> FrameTimes {
     };
     let mut spans = Vec::new();
     for chosen in chosen {
-        match chosen.images.stamped.filter(|times| times.is_increasing) {
+        match chosen.images.stamped.filter(|times| times.are_usable(chosen.images.frames)) {
             Some(times) => spans.push(times),
             None => return fall_back(format!("the timestamps of camera {} do not increase", chosen.id)),
         }

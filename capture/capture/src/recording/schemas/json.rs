@@ -25,7 +25,8 @@ fn count(message: &Value, key: &str) -> Result<u32, String> {
 }
 
 fn numbers(message: &Value, key: &str) -> Result<Vec<f64>, String> {
-    let list = match message.get(key) {
+    // The schema has capitals, its types in some languages have not.
+    let list = match message.get(key).or_else(|| message.get(key.to_lowercase())) {
         None | Some(Value::Null) => return Ok(Vec::new()),
         Some(list) => list.as_array().ok_or_else(|| format!("{key} is no list"))?,
     };
