@@ -385,14 +385,15 @@ fn a_write_that_does_not_fit_is_followed_by_a_new_file_too() {
     memory.with(|files| files.free = Some(1 << 30));
     let recorder = Recorder::start(memory.clone(), &[note()], &RecorderConfig::default()).unwrap();
     let mut tap = recorder.tap(Script("a".into(), 0, 1_000_000)).unwrap();
-    pass_until(&recorder, &mut tap, |state| state.frames > 0);
+    let mut passed = pass_until(&recorder, &mut tap, |state| state.frames > 0);
     memory.with(|files| (files.free, files.is_full) = (Some(0), true));
-    pass_until(&recorder, &mut tap, |state| state.dropped > 0);
+    passed += pass_until(&recorder, &mut tap, |state| state.dropped > 0);
     memory.with(|files| (files.free, files.is_full) = (Some(1 << 30), false));
     let before = recorder.state().frames;
-    pass_until(&recorder, &mut tap, |state| state.frames > before + 10);
+    passed += pass_until(&recorder, &mut tap, |state| state.frames > before + 10);
     drop(tap);
     let state = recorder.finish();
+    assert_eq!(state.frames + state.dropped, passed, "every frame is in a file or counted");
     assert_eq!((state.files, state.problem), (2, None));
     memory.with(|files| drop(summary(&files.files[1])));
 }

@@ -289,14 +289,12 @@ impl<D: Disk> Writing<D> {
             *part = Some(self.next()?);
             tracing::warn!("there is space again: the recording goes on in {}", self.shared.lock().file.display());
         }
-        match part {
-            Some(part) => {
-                part.write(item)?;
-                self.count(item);
-            }
-            None => self.shared.lock().dropped += u64::from(item.bytes_sent.is_some()),
+        let written = part.as_mut().map(|part| part.write(item));
+        match &written {
+            Some(Ok(())) => self.count(item),
+            Some(Err(_)) | None => self.shared.lock().dropped += u64::from(item.bytes_sent.is_some()),
         }
-        Ok(())
+        written.unwrap_or(Ok(()))
     }
 
     /// Flushes a chunk that is due, and syncs the file to the disk; ends the file when the disk is nearly full.
