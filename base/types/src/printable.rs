@@ -41,7 +41,8 @@ pub fn shortened(value: &str) -> Cow<'_, str> {
     escape(value, MAX_VALUE)
 }
 
-/// Applies [`shortened`] to every value that a text has in double quotes or backticks, as errors of parsers have.
+/// Applies [`shortened`] to every value that a text has in double quotes or backticks, as errors of parsers have, and to
+/// every long word that is no path.
 ///
 /// ```
 /// use flyrig_types::shorten_values;
@@ -64,7 +65,13 @@ pub fn shorten_values(text: &str) -> Cow<'_, str> {
         short.push(quote);
         rest = &after[end + 1..];
     }
-    Cow::Owned(short + rest)
+    short.push_str(rest);
+    let is_long = |word: &str| word.chars().nth(MAX_VALUE).is_some() && !word.contains('/') && !word.contains(":\\");
+    let words = short.split_inclusive(char::is_whitespace).map(|word| match word.trim_end() {
+        long if is_long(long) => shortened(long) + &word[long.len()..],
+        _ => Cow::Borrowed(word),
+    });
+    Cow::Owned(words.collect())
 }
 
 /// Returns the position of the quote that ends a value; a backslash hides the character after it.
@@ -148,7 +155,11 @@ mod tests {
         assert_eq!(shortened("\u{1b}[2J"), "\\u{1b}[2J");
         assert_eq!(shortened(&"\n".repeat(1000)), "\\n".repeat(48) + "...");
         let (long, cut) = ("x".repeat(5000), "x".repeat(97) + "...");
-        let of = |value: &str| format!("`{value}` and \"a\\\"{value}\" of x's \" {}", "y".repeat(200));
+        let of = |value: &str| format!("`{value}` and \"a\\\"{value}\" of x's \" {}", "y ".repeat(200));
+        let shown = format!("it is '{}... at\nmost", &long[..96]);
+        assert_eq!(shorten_values(&format!("it is '{long}', at\nmost")), shown);
+        let path = format!("/tmp/{long}: no such file");
+        assert_eq!(shorten_values(&path), path);
         assert_eq!(shorten_values(&of(&long)), of(&cut).replace("a\\\"xxx", "a\\\""));
         let long = "a".repeat(10_000);
         assert_eq!(escape_controls(&format!("{long}\u{7}")), format!("{long}\\u{{7}}"));
