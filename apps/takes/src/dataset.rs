@@ -6,7 +6,7 @@ use anyhow::{Context, Result, bail};
 use flyrig_calib::{CalibError, load_calibration};
 use flyrig_capture::{VideoOptions, VideoReplay, folder_image_size};
 use flyrig_fusion::{Origin, PerceptionSettings};
-use flyrig_types::{Camera, CameraId, Image, PixelFormat, Rig};
+use flyrig_types::{Camera, CameraId, Image, PixelFormat, Rig, shortened};
 
 /// Files of a calibration, of which at least one lies in a calibrated folder.
 const CALIBRATION_FILES: [&str; 3] = ["calibration.toml", "intri.yml", "extri.yml"];
@@ -46,7 +46,7 @@ pub fn select_cameras(rig: &Rig, names: &[String], place: &str) -> Result<Rig> {
         .map(|name| {
             rig.slot(&name.as_str().into()).map(|slot| rig.cameras[slot].clone()).with_context(|| {
                 let known: Vec<_> = rig.cameras.iter().map(|camera| camera.id.as_str()).collect();
-                format!("camera {name} is not in {place}; it has: {}", known.join(", "))
+                format!("camera {} is not in {place}; it has: {}", shortened(name), known.join(", "))
             })
         })
         .collect::<Result<Vec<Camera>>>()?;

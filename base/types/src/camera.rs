@@ -3,7 +3,7 @@
 use glam::{DMat3, DVec2, DVec3};
 use serde::{Deserialize, Serialize};
 
-use crate::{CameraId, ColorMatch, Isometry};
+use crate::{CameraId, CameraNameError, ColorMatch, Isometry};
 
 /// Largest side of an image, pixels.
 pub const MAX_IMAGE_SIDE: u32 = 16_384;
@@ -258,6 +258,9 @@ pub enum CameraError {
         /// Permitted range.
         expected: &'static str,
     },
+    /// No camera may have this name.
+    #[error(transparent)]
+    Name(#[from] CameraNameError),
     /// Two cameras have one name.
     #[error("camera {0} appears twice in the rig")]
     Duplicate(CameraId),
@@ -365,11 +368,12 @@ impl Camera {
         camera
     }
 
-    /// Checks all numbers.
+    /// Checks the name ([`CameraId::check`]) and all numbers.
     ///
     /// # Errors
     /// [`CameraError`] names camera and field.
     pub fn validate(&self) -> Result<(), CameraError> {
+        self.id.check()?;
         let camera = || self.id.clone();
         let i = &self.intrinsics;
         let not_finite = |field| CameraError::NotFinite { camera: camera(), field };

@@ -188,7 +188,13 @@ fn list_cameras(root: &Path) -> Result<Vec<CameraId>, CaptureError> {
         let message = format!("{} has no camera folders", images.display());
         return Err(CaptureError::general(CaptureErrorKind::NotFound, message));
     }
-    Ok(names.into_iter().map(CameraId::from).collect())
+    let checked = |name: String| {
+        let camera = CameraId::from(name);
+        let refused =
+            |error| CaptureError::general(CaptureErrorKind::Unsupported, format!("{}: {error}", images.display()));
+        camera.check().map_err(refused).map(|()| camera)
+    };
+    names.into_iter().map(checked).collect()
 }
 
 fn camera_images(root: &Path, camera: &CameraId) -> Result<BTreeMap<String, PathBuf>, CaptureError> {

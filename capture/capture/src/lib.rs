@@ -59,8 +59,9 @@ pub use nokhwa_camera::{NokhwaCamera, NokhwaDevice, NokhwaOptions, nokhwa_camera
 pub use pool::BufferPool;
 pub use queue::{LatestQueue, PopError};
 pub use recording::{
-    Compression, McapReplay, MessageTap, Note, RESERVE_BYTES, Recorded, RecordedSpan, Recorder, RecorderConfig,
-    Recording, Rotation, RotationError, SourceTap, recorded_messages, recorded_notes, recorded_spans,
+    Compression, ForeignCamera, ForeignCameras, FrameTimes, McapReplay, MessageTap, Note, RESERVE_BYTES, Recorded,
+    RecordedCamera, RecordedSpan, Recorder, RecorderConfig, Recording, Rotation, RotationError, SourceTap,
+    foreign_cameras, recorded_messages, recorded_notes, recorded_spans,
 };
 pub use rgb::{to_rgb8, to_rgb8_into};
 pub use source::{CameraSource, NetworkHealth, SourceHealth};

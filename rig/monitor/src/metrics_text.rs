@@ -168,7 +168,8 @@ impl Collector for Snapshot {
         if let Some(free) = recorded.free_bytes {
             page.gauge("recording_free_bytes", "Free space of its disk.", free)?;
         }
-        page.gauge("recording_broken", "Whether the recording broke off.", i64::from(recorded.problem.is_some()))
+        let is_broken = recorded.problem.is_some() || recorded.paused.is_some();
+        page.gauge("recording_broken", "Whether the recording broke off or waits for space.", i64::from(is_broken))
     }
 }
 

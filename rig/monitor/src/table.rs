@@ -101,7 +101,7 @@ pub fn table(health: &Health, recorded: Option<&Recorded>) -> String {
         let (frames, mb) = (recorded.frames, recorded.bytes as f64 / 1e6);
         let file = recorded.file.display();
         let _ = writeln!(text, "recording: {frames} frames, {mb:.1} MB, {} files, now {file}{free}", recorded.files);
-        if let Some(problem) = &recorded.problem {
+        if let Some(problem) = recorded.problem.as_ref().or(recorded.paused.as_ref()) {
             let _ = writeln!(text, "the recording broke off: {problem}");
         }
     }

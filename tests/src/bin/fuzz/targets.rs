@@ -5,7 +5,10 @@ use std::{cell::RefCell, fs, path::Path, time::Duration};
 
 use flyrig_body::{BodyError, Joint, MotionClip, RetargetOptions, Skeleton, load_gltf, load_gltf_motion, parse_bvh};
 use flyrig_calib::load_easymocap;
-use flyrig_capture::{CameraSource as _, FolderOptions, FolderReplay, McapReplay, recorded_notes, to_rgb8};
+use flyrig_capture::{
+    CameraSource as _, FolderOptions, FolderReplay, McapReplay, RecordedCamera, foreign_cameras, recorded_notes,
+    to_rgb8,
+};
 use flyrig_page::{Page, PageMessageKind};
 use flyrig_renderer::{PlyError, parse_anisotropic_ply};
 use flyrig_transport::{
@@ -175,9 +178,12 @@ fn mcap(input: &[u8]) -> Result<String, String> {
         for (_, note) in &notes {
             let _ = (decode_calibration(note), decode_transforms(note));
         }
+        // A file without cameras of flyrig's may be one of another program.
+        let foreign = foreign_cameras(&path).map(|found| found.cameras).unwrap_or_default();
+        let own = ["a", "b"].map(|camera| RecordedCamera::new(camera.into()));
         let mut frames = 0;
-        for camera in ["a", "b"] {
-            let mut replay = McapReplay::open(&camera.into(), &path).map_err(|error| error.to_string())?;
+        for camera in foreign.into_iter().map(|camera| camera.images).chain(own) {
+            let mut replay = McapReplay::open_camera(&camera, &path).map_err(|error| error.to_string())?;
             // More frames than a recording of a few kilobytes can hold.
             for _ in 0..10_000 {
                 match replay.next_frame(Duration::ZERO) {
