@@ -19,7 +19,9 @@ pub(crate) fn missing_bytes(file: &mut (impl Read + Seek)) -> Option<u64> {
         [b'R', b'I', b'F', b'F', ..] => riff_end(file, length),
         [0x1a, 0x45, 0xdf, 0xa3, ..] => matroska_end(file, length),
         [_, _, _, _, kind @ .., _, _, _, _] if is_box(kind) => mp4_end(file, length),
-        [0x47, ..] if bytes_at(file, TRANSPORT_PACKET) == Some([0x47]) => Some(length.next_multiple_of(TRANSPORT_PACKET)),
+        [0x47, ..] if bytes_at(file, TRANSPORT_PACKET) == Some([0x47]) => {
+            Some(length.next_multiple_of(TRANSPORT_PACKET))
+        }
         _ => None,
     };
     end.and_then(|end| end.checked_sub(length)).filter(|missing| *missing > 0)

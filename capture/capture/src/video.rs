@@ -194,7 +194,8 @@ impl VideoReplay {
         if self.next == 0 {
             return Ok(());
         }
-        Err(self.error(CaptureErrorKind::Corrupt, format!("a frame after {} cannot be decoded ({cause})", self.next - 1)))
+        Err(self
+            .error(CaptureErrorKind::Corrupt, format!("a frame after {} cannot be decoded ({cause})", self.next - 1)))
     }
 
     /// Returns the error at the end of the file.

@@ -85,7 +85,8 @@ impl Film<'_> {
         encoder.flush().unwrap();
         pass_on(&mut encoder);
         for second in 0..self.sound / 1000 {
-            let packet = PacketMut::new(16_000).with_time_base(millis()).with_pts(Timestamp::from_millis(1000 * second));
+            let packet =
+                PacketMut::new(16_000).with_time_base(millis()).with_pts(Timestamp::from_millis(1000 * second));
             muxer.push(packet.with_dts(Timestamp::from_millis(1000 * second)).with_stream_index(1).freeze()).unwrap();
         }
         muxer.flush().unwrap();
@@ -129,9 +130,13 @@ fn variable() -> Vec<i64> {
 fn every_frame_has_its_own_time_in_every_container() {
     let dir = tempfile::tempdir().unwrap();
     let constant: Vec<i64> = (0..40).map(|i| 40 * i).collect();
-    for (container, codec, reordered) in
-        [("mp4", "mpeg4", 0), ("mp4", "mpeg4", 2), ("matroska", "mpeg4", 2), ("mov", "mjpeg", 0), ("mpegts", "mpeg4", 2)]
-    {
+    for (container, codec, reordered) in [
+        ("mp4", "mpeg4", 0),
+        ("mp4", "mpeg4", 2),
+        ("matroska", "mpeg4", 2),
+        ("mov", "mjpeg", 0),
+        ("mpegts", "mpeg4", 2),
+    ] {
         for (rate, times) in [("constant", constant.clone()), ("variable", variable())] {
             let name = format!("{container} {codec} {reordered} {rate}");
             let path = dir.path().join("film");
@@ -146,11 +151,13 @@ fn a_header_that_promises_more_is_no_damage() {
     let dir = tempfile::tempdir().unwrap();
     let path = dir.path().join("film");
     // OpenCV and others multiply the length of the whole file by the frame rate.
-    Film { container: "matroska", codec: "mpeg4", reordered: 2, times: variable(), sound: 6000, muxing: &[] }.write(&path);
+    Film { container: "matroska", codec: "mpeg4", reordered: 2, times: variable(), sound: 6000, muxing: &[] }
+        .write(&path);
     assert_times("longer sound", &path, &variable());
     // A pipe: the length is unknown.
     let live = [("live", "1")];
-    Film { container: "matroska", codec: "mpeg4", reordered: 0, times: variable(), sound: 0, muxing: &live }.write(&path);
+    Film { container: "matroska", codec: "mpeg4", reordered: 0, times: variable(), sound: 0, muxing: &live }
+        .write(&path);
     assert_times("live", &path, &variable());
     let times: Vec<i64> = (0..40).map(|i| 40 * i).collect();
     Film { container: "avi", codec: "mjpeg", reordered: 0, times: times.clone(), sound: 0, muxing: &[] }.write(&path);
