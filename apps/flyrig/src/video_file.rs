@@ -1,6 +1,6 @@
 //! Video files whose images keep their own times.
 
-use std::{fs::File, path::Path};
+use std::{fs::File, path::Path, time::Duration};
 
 use ac_ffmpeg::{
     Error,
@@ -43,7 +43,8 @@ impl Ticks {
     /// Returns the place of an image that a source took at a time, nanoseconds. Times of different sources have nothing
     /// in common.
     fn next(&mut self, source: u64, nanos: i64) -> i64 {
-        let ticks = |nanos: i64| (i128::from(nanos) * i128::from(self.per_second) + 500_000_000).div_euclid(1_000_000_000);
+        let ticks =
+            |nanos: i64| (i128::from(nanos) * i128::from(self.per_second) + 500_000_000).div_euclid(1_000_000_000);
         let (origin, tick) = match self.last {
             Some((known, origin, last)) if known == source => {
                 let tick = i64::try_from(ticks(nanos.saturating_sub(origin))).unwrap_or(i64::MAX);
@@ -68,7 +69,8 @@ impl VideoFile {
     /// The file cannot be created, with the cause.
     pub fn create(path: &Path, (width, height): (u32, u32)) -> Result<Self> {
         // AVI repeats images in place of times; more than 65535 ticks per second MPEG-4 does not count.
-        let (container, codec, pixels, per_second) = if path.extension().is_some_and(|e| e.eq_ignore_ascii_case("avi")) {
+        let (container, codec, pixels, per_second) = if path.extension().is_some_and(|e| e.eq_ignore_ascii_case("avi"))
+        {
             ("avi", "mjpeg", "yuvj420p", 200)
         } else {
             ("mp4", "mpeg4", "yuv420p", 50_000)
@@ -132,6 +134,8 @@ impl VideoFile {
 
     fn pass_on(&mut self) -> Result<()> {
         while let Some(packet) = self.encoder.take()? {
+            // Without a duration, the last image is not shown.
+            let packet = packet.into_mut().with_duration(Duration::from_nanos(NOMINAL_NANOS as u64)).freeze();
             self.muxer.push(packet.with_stream_index(0))?;
         }
         Ok(())
@@ -156,8 +160,6 @@ fn pixel_format(name: &str) -> Result<PixelFormat, Error> {
 
 #[cfg(test)]
 mod tests {
-    use std::time::Duration;
-
     use flyrig_capture::{CameraSource as _, VideoOptions, VideoReplay};
 
     use super::*;

@@ -5,6 +5,7 @@
 use std::{
     fmt,
     fs::File,
+    io::Seek as _,
     ops::Range,
     path::{Path, PathBuf},
     sync::{Arc, Once},
@@ -104,8 +105,12 @@ impl VideoReplay {
         };
         let mut file = File::open(path).map_err(|cause| unreadable(&cause))?;
         let missing = missing_bytes(&mut file);
+        file.rewind().map_err(|cause| unreadable(&cause))?;
         // The last packet of a cut file is half a picture. Elsewhere the reader's doubts are too many: joined files.
-        let builder = Demuxer::builder().set_option("fflags", if missing.is_some() { "discardcorrupt" } else { "" });
+        let mut builder = Demuxer::builder();
+        if missing.is_some() {
+            builder = builder.set_option("fflags", "discardcorrupt");
+        }
         let demuxer = builder.build(IO::from_seekable_read_stream(file)).map_err(|cause| unreadable(&cause))?;
         let demuxer = demuxer.find_stream_info(None).map_err(|(_, cause)| unreadable(&cause))?;
         let videos = demuxer.streams().iter().map(Stream::codec_parameters).enumerate();

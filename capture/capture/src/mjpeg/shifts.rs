@@ -106,7 +106,9 @@ fn has_stretch(now: &Levels, before: Option<&Levels>) -> bool {
                 count += u32::from(is_such(*jump) && before.is_none_or(|before| is_such(jump - before.jumps[i])));
                 counts.push(count);
             }
-            if 8 * count as usize >= width && follows_a_row(width, &counts, before.is_some()) {
+            // Where many blocks jump, such as in noise, some stretch does by chance.
+            let is_rare = count as usize <= width + now.jumps.len() / 6;
+            if is_rare && 8 * count as usize >= width && follows_a_row(width, &counts, before.is_some()) {
                 return true;
             }
         }
@@ -126,6 +128,7 @@ fn follows_a_row(width: usize, counts: &[u32], has_before: bool) -> bool {
     let is_such = |inside: Option<f32>, beside: Option<f32>| {
         inside.is_some_and(|share| share >= SHARE) && beside.is_some_and(|share| share <= BESIDE)
     };
+    let half = 16.max(width / 2);
     (0..=rows).any(|next| {
         let row = next.checked_sub(1);
         (SHORTEST..=width.saturating_sub(SHORTEST)).any(|column| {
@@ -136,8 +139,8 @@ fn follows_a_row(width: usize, counts: &[u32], has_before: bool) -> bool {
             match (right, left) {
                 (Some(_), Some(_)) => right_is_such() && left_is_such(),
                 // The first and the last row have half of the evidence.
-                (None, _) => has_before && column >= width / 4 && left_is_such(),
-                (_, None) => has_before && width - column >= width / 4 && right_is_such(),
+                (None, _) => has_before && column >= half && left_is_such(),
+                (_, None) => has_before && width - column >= half && right_is_such(),
             }
         })
     })
@@ -147,9 +150,9 @@ fn follows_a_row(width: usize, counts: &[u32], has_before: bool) -> bool {
 /// those before it as they were.
 fn is_changed_from_a_place_on(now: &Levels, before: &Levels) -> bool {
     let changes: Vec<f32> = now.means.iter().zip(&before.means).map(|(now, before)| now - before).collect();
-    let mut counts = Vec::with_capacity(changes.len() + 1);
-    // Anywhere in a row, or by precisely one value at its ends as well: a light that was switched on between two rows
-    // changes each thing by a value of its own.
+    let (mut counts, mut jumps) = (Vec::with_capacity(changes.len() + 1), Vec::new());
+    // Anywhere in a row, or by precisely one value and with a sharp edge at its ends as well: a light that was switched on
+    // between two rows changes each thing by a value of its own.
     let wide = [2.0f32, 4.0, 8.0, 16.0, 32.0, 64.0].into_iter().map(|least| (least, 2.5 * least, false));
     let narrow =
         std::iter::successors(Some(3.0f32), |value| Some(1.1 * value + 0.5)).take_while(|value| *value < 200.0);
@@ -165,23 +168,46 @@ fn is_changed_from_a_place_on(now: &Levels, before: &Levels) -> bool {
                 sums[1] += u32::from(change.abs() < least / 2.0);
                 counts.push(sums);
             }
-            2 * sums[0] as usize >= now.across && is_split(now.across, &counts, is_narrow)
+            if 2 * (sums[0] as usize) < now.across {
+                return false;
+            }
+            // Upper edges before each one that jump by at least half of it.
+            jumps.clear();
+            if is_narrow {
+                let mut sum = 0u32;
+                jumps.push(sum);
+                jumps.extend(now.jumps.iter().map(|jump| {
+                    sum += u32::from(2.0 * sign * jump >= least);
+                    sum
+                }));
+            }
+            is_split(now, &counts, &jumps)
         })
     })
 }
 
 /// Returns whether MCUs did not change before some place and did behind it; by `counts` of those that did and did not.
-fn is_split(across: usize, counts: &[[u32; 2]], at_ends: bool) -> bool {
-    let count = counts.len() - 1;
+/// `jumps` are the upper edges that jump, without which places at the ends of rows are no evidence.
+fn is_split(now: &Levels, counts: &[[u32; 2]], jumps: &[u32]) -> bool {
+    let (across, width, count) = (now.across, now.width, counts.len() - 1);
     let most = |which: usize, from: usize, to: usize| {
         (counts[to][which] - counts[from][which]) as f32 >= SHARE * (to - from) as f32
+    };
+    let is_sharp = |start: usize, column: usize| {
+        let Some(row) = (start / across).checked_sub(1).filter(|row| (row + 1) * width < jumps.len()) else {
+            return false;
+        };
+        let (from, to) = (row * width + column * (width / across), (row + 1) * width);
+        2 * (jumps[to] - jumps[from]) as usize >= to - from
     };
     // Too little remains behind places of the last row to differ by much.
     (across / 4..count.saturating_sub(across)).any(|place| {
         let column = place % across;
         let start = place - column;
         let end = start + across;
-        (at_ends || (SHORTEST..=across.saturating_sub(SHORTEST)).contains(&column))
+        let is_inside = (SHORTEST..=across.saturating_sub(SHORTEST)).contains(&column);
+        (is_inside
+            || is_sharp(if 2 * column > across { end } else { start }, if 2 * column > across { 0 } else { column }))
             && most(0, place, count)
             && most(1, 0, place)
             && most(0, place, end)
