@@ -26,6 +26,7 @@ mod source_tests;
 mod stream_recording;
 mod sync_check;
 mod toml_errors;
+mod video_file;
 mod view;
 mod watch;
 

@@ -27,6 +27,7 @@
 mod blocking;
 mod camera_options;
 mod clock;
+mod container;
 mod decoding;
 mod device_settings;
 mod encoding;
@@ -55,6 +56,7 @@ pub use device_settings::{DeviceOptions, DeviceSettings};
 pub use encoding::JpegEncoding;
 pub use error::{CaptureError, CaptureErrorKind};
 pub use folder::{FolderOptions, FolderReplay, folder_image_size};
+pub use image_file::read_image;
 pub use nokhwa_camera::{NokhwaCamera, NokhwaDevice, NokhwaOptions, nokhwa_cameras};
 pub use pool::BufferPool;
 pub use queue::{LatestQueue, PopError};
