@@ -63,9 +63,9 @@ pub struct Received<T> {
     pub topic: String,
     /// Header of the message.
     pub header: Header,
-    /// Time from the publisher's hand-in to the receipt here, by wall clocks; may be negative between hosts.
+    /// Time from the publisher's hand-in to the receipt here; between hosts and for images by wall clocks, where it may be negative.
     pub latency_nanos: i64,
-    /// Whether both ends run on one host, so that the latency is exact unless the clock is set meanwhile.
+    /// Whether both ends run on one host, so that the latency is exact; that of images unless the wall clock is set meanwhile.
     pub latency_is_exact: bool,
     /// Decoded message.
     pub body: T,

@@ -197,6 +197,7 @@ fn good_header(sequence: u64) -> FrameHeader {
             frame: sequence,
             capture_nanos: host_clock().now_nanos(),
             publish_unix_nanos: 0,
+            publish_nanos: 0,
             host: 1,
             publisher: 0x666,
             width: 4,
