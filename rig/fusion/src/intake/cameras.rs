@@ -132,12 +132,13 @@ impl Intake {
         while !(self.ended || self.every_set && !self.ready.is_empty()) {
             match self.threads.queue().pop(wait) {
                 Ok(frame) => {
-                    self.time(&frame);
+                    let now_nanos = monotonic_nanos();
+                    self.time(&frame, now_nanos);
                     let frame = match &mut self.aligner {
                         Some(aligner) => aligner.align(frame),
                         None => frame,
                     };
-                    self.ready.extend(self.sync.push(frame));
+                    self.ready.extend(self.sync.push_at(frame, now_nanos));
                     wait = Duration::ZERO;
                 }
                 Err(PopError::Closed) => {
@@ -145,13 +146,27 @@ impl Intake {
                     self.ready.extend(self.sync.flush());
                 }
                 Err(PopError::Timeout) => {
+                    let overdue = self.give_up();
                     wait = deadline.saturating_duration_since(Instant::now());
                     if !self.ready.is_empty() || wait.is_zero() {
                         break;
                     }
+                    wait = overdue.map_or(wait, |overdue| wait.min(overdue));
                 }
             }
         }
+    }
+
+    /// Forms the live frame sets whose missing frames would have arrived by now. Returns the time until that is so for the next one; `None`
+    /// where only a frame completes it.
+    fn give_up(&mut self) -> Option<Duration> {
+        if self.every_set {
+            return None;
+        }
+        let now_nanos = monotonic_nanos();
+        self.ready.extend(self.sync.give_up(now_nanos));
+        let left = self.sync.next_deadline()?.saturating_sub(now_nanos);
+        Some(Duration::from_nanos(u64::try_from(left).unwrap_or(0)))
     }
 
     /// Declares that capture times are on this computer's clock, so that latency is measured.
@@ -161,10 +176,10 @@ impl Intake {
     }
 
     /// Updates the timing of a frame's camera.
-    fn time(&mut self, frame: &Frame) {
+    fn time(&mut self, frame: &Frame, now_nanos: i64) {
         self.timing.resize(self.cameras.len(), Timing::default());
         if let Some(slot) = self.cameras.iter().position(|camera| *camera == frame.camera) {
-            self.timing[slot].add(frame.capture_nanos, monotonic_nanos());
+            self.timing[slot].add(frame.capture_nanos, now_nanos);
         }
     }
 
