@@ -17,7 +17,7 @@ use flyrig_fusion::{CameraHealth, Health, STUCK_AFTER, resident_mib};
 use flyrig_gpu::GpuContext;
 use flyrig_types::CameraId;
 
-use crate::{metrics_text, page_server::PageServer, table};
+use crate::{metrics_text, page_server::PageServer, rate_watch::RateWatch, table};
 
 /// Time from one report to the next.
 const EVERY: Duration = Duration::from_secs(1);
@@ -48,6 +48,7 @@ pub struct Monitor {
     logged: BTreeMap<String, (u64, bool)>,
     /// Cameras that were reported as silent.
     silent: BTreeSet<CameraId>,
+    rates: RateWatch,
     /// Status that the service manager has.
     status: String,
 }
@@ -68,8 +69,8 @@ impl Monitor {
             let health = Health { resident_mib: resident_mib(), ..Health::default() };
             metrics.publish(metrics_text::prometheus(&health, None));
         }
-        let (reported, watchdog, logged, silent) = Default::default();
-        Ok(Self { metrics, show_table, reported, watchdog, logged, silent, status: String::new() })
+        let (reported, watchdog, logged, silent, rates) = Default::default();
+        Ok(Self { metrics, show_table, reported, watchdog, logged, silent, rates, status: String::new() })
     }
 
     /// Tells the service manager that the service is up. The watchdog is in force from here on.
@@ -128,6 +129,9 @@ impl Monitor {
                 None if self.silent.remove(name) => tracing::info!("camera {name}: frames come again"),
                 _ => {}
             }
+        }
+        for change in self.rates.changes(health) {
+            change.log();
         }
         for (thread, restarts) in table::thread_restarts(health) {
             let logged = self.logged.entry(thread.clone()).or_default();

@@ -264,3 +264,70 @@ fn camera_drops(camera: &CameraStats) -> Vec<(String, u64)> {
     drops.push((format!("frames of {} lost before us", camera.camera), camera.health.lost_by_driver));
     drops
 }
+
+#[cfg(test)]
+mod tests {
+    use flyrig_types::{Image, PixelFormat};
+
+    use super::*;
+
+    const PERIOD: Duration = Duration::from_millis(100);
+
+    /// Camera that captures for two seconds at a time, each followed by a pause in which nothing comes.
+    struct Paused {
+        camera: CameraId,
+        start: Instant,
+        next: u32,
+        /// Whether the last frame before each pause is lost.
+        loses_last: bool,
+    }
+
+    impl CameraSource for Paused {
+        fn camera(&self) -> &CameraId {
+            &self.camera
+        }
+
+        fn next_frame(&mut self, timeout: Duration) -> Result<Frame, CaptureError> {
+            let number = self.next;
+            // Twenty frames of every sixty.
+            let due = self.start + PERIOD * number;
+            let wait = due.saturating_duration_since(Instant::now());
+            std::thread::sleep(wait.min(timeout));
+            let is_late = || CaptureError::new(&self.camera, flyrig_capture::CaptureErrorKind::Timeout, "not yet");
+            if wait > timeout {
+                return Err(is_late());
+            }
+            self.next += 1;
+            let turn = number % 60;
+            if turn >= 20 || turn == 19 && self.loses_last {
+                return Err(is_late());
+            }
+            Ok(Frame {
+                camera: self.camera.clone(),
+                sequence: u64::from(number),
+                capture_nanos: i64::from(number) * PERIOD.as_nanos() as i64,
+                exposure_nanos: None,
+                image: Image::new(1, 1, PixelFormat::Rgb8, vec![0; 3]).unwrap(),
+                mask: None,
+            })
+        }
+    }
+
+    #[test]
+    fn a_set_without_a_lost_frame_comes_before_any_later_frame() {
+        let start = Instant::now();
+        let source = |name: &str, loses_last: bool| {
+            Box::new(Paused { camera: name.into(), start, next: 0, loses_last }) as Box<dyn CameraSource>
+        };
+        let sources = vec![source("a", false), source("b", true)];
+        let mut intake =
+            Intake::start(sources, InputFormat::Rgb, &SyncSettings::default(), Pacing::AsDelivered).unwrap();
+        // On a busy machine frames arrive irregularly, and a set may wait for the frames after the pause.
+        let is_early = (0..400).any(|_| {
+            let set = intake.next_set(Duration::from_millis(500));
+            let number = set.map(|set| set.master_nanos / PERIOD.as_nanos() as i64);
+            number.is_some_and(|number| number % 60 == 19 && start.elapsed() < PERIOD * (number as u32 + 35))
+        });
+        assert!(is_early, "every set waited for the frames after its pause");
+    }
+}

@@ -42,7 +42,7 @@ fn subscriber(rig: &str, cameras: &[&str], endpoints: &[String]) -> CameraSubscr
     CameraSubscriber::open(&config, &cameras, our_clock()).unwrap()
 }
 
-fn frame(camera: &str, sequence: u64) -> Frame {
+pub fn frame(camera: &str, sequence: u64) -> Frame {
     let (format, bytes) = match sequence % 2 {
         0 => (PixelFormat::Mjpeg, vec![sequence as u8; 3000 + sequence as usize]),
         _ => (PixelFormat::Yuyv, vec![sequence as u8; 4 * 2 * 2]),
