@@ -7,7 +7,7 @@ use std::collections::VecDeque;
 
 use flyrig_types::{Frame, FrameSet};
 
-use crate::sync::Synchronizer;
+use crate::sync::{Camera, Synchronizer};
 
 /// Frames whose arrival is remembered, and from which it is known.
 const ARRIVALS: usize = 32;
@@ -29,6 +29,14 @@ impl Arrivals {
     fn longest(&self, period: u64) -> Option<i64> {
         let (least, most) = (self.0.iter().min()?, self.0.iter().max()?);
         (self.0.len() >= KNOWN_FROM && most.abs_diff(*least) < period).then_some(*most)
+    }
+}
+
+impl Camera {
+    /// Returns the period at which the camera captures, also where most of its frames are lost; those intervals are whole periods.
+    fn own_period(&self) -> Option<u64> {
+        let (usual, least) = (self.period()?, *self.intervals.iter().min()?);
+        Some(if usual / 3 > least / 2 { least } else { usual })
     }
 }
 
@@ -63,7 +71,7 @@ impl Synchronizer {
     /// Returns when a camera's frame for an instant should have arrived; `None` where that is not known.
     fn deadline(&self, slot: usize, clock: usize, nanos: i64) -> Option<i64> {
         let camera = self.cameras.get(slot)?;
-        let (period, latest) = (camera.period()?, camera.latest?);
+        let (period, latest) = (camera.own_period()?, camera.latest?);
         let longest = camera.arrivals.longest(period)?;
         let (period, margin) = (i64::try_from(period).ok()?, i64::try_from(period / 4).ok()?);
         let offset = camera.offset.filter(|(by, _)| *by == clock).map_or(0, |(_, offset)| offset);

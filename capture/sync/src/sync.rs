@@ -127,7 +127,7 @@ pub(crate) struct Camera {
     /// Interval between the previous frame and that one, nanoseconds.
     interval: Option<u64>,
     /// Recent intervals, newest last.
-    intervals: VecDeque<u64>,
+    pub intervals: VecDeque<u64>,
     /// Per other camera, the frames since this one's last instant.
     missed: Vec<u64>,
     /// Time of the last frame that joined a frame set.
