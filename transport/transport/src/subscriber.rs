@@ -19,7 +19,7 @@ use crate::{
     },
     report::TopicReport,
     session::{
-        config::{LARGEST_QUESTION, TransportConfig},
+        config::{LARGEST_QUESTION, Side, TransportConfig},
         opening::{self, Opened},
     },
     stats::RigStats,
@@ -112,7 +112,7 @@ impl Subscriber {
         let rig = &config.rig;
         let failed = |error: zenoh::Error| TransportError::session(format!("subscriber of rig {rig}"), &error);
         let largest = MAX_MESSAGE_BYTES.max(MAX_SPLAT_BYTES) + LARGEST_QUESTION;
-        let Opened { session, .. } = opening::open(config, largest, &[])?;
+        let Opened { session, .. } = opening::open(config, Side::Receiver, largest, &[])?;
         let id = session.zid().to_string();
         let id = config.key.as_ref().map_or_else(|| id.clone(), |key| format!("{}.{id}", key.topic_name));
         let inbox = Arc::new(Inbox::new(format!("{VIEWER_PREFIX}{id}"), config.inbox_bytes));

@@ -18,7 +18,7 @@ use crate::{
     header::{Header, MessageKind, empty_header},
     keys,
     session::{
-        config::{LARGEST_QUESTION, TransportConfig},
+        config::{LARGEST_QUESTION, Side, TransportConfig},
         opening::{self, Opened},
     },
     topic::{Body, PublishOutcome, Topic, TopicCounts},
@@ -69,7 +69,7 @@ impl CameraPublisher {
             })
         };
         let cameras: Vec<Lane> = cameras.iter().map(lane).collect::<Result<_, TransportError>>()?;
-        let Opened { session, endpoints, .. } = opening::open(config, LARGEST_QUESTION, &[])?;
+        let Opened { session, endpoints, .. } = opening::open(config, Side::Sender, LARGEST_QUESTION, &[])?;
         let failed = |error: zenoh::Error| TransportError::session(format!("cameras of rig {rig}"), &error);
         let topics: Vec<_> = cameras.iter().flat_map(|lane| [lane.frames.clone(), lane.status.clone()]).collect();
         let (shared, woken) = PublisherState::new(rig, &session, &topics, Leases::new(0, Duration::ZERO, 0));

@@ -78,18 +78,24 @@ struct Parties {
 }
 
 impl Parties {
-    fn open(endpoint: &str) -> Self {
-        let config = TransportConfig {
-            listen: Vec::new(),
-            connect: vec![endpoint.to_owned()],
+    /// Opens all of them; each connects to the router, or directly to those whose messages it receives.
+    fn open(router: Option<&str>) -> Self {
+        let is_direct = router.is_none();
+        let config = |listen: Vec<String>, direct: &[String]| TransportConfig {
+            listen,
+            connect: router.iter().map(|router| (*router).to_owned()).chain(direct.iter().cloned()).collect(),
             ..TransportConfig::publisher("test")
         };
         let names = [CameraId::from("a")];
-        let host = CameraPublisher::open(&config, &names, host_clock()).unwrap();
-        let cameras = CameraSubscriber::open(&config, &names, our_clock()).unwrap();
-        let rig = Publisher::open(&config).unwrap();
+        let own = || vec!["tcp/127.0.0.1:0".to_owned()];
+        let host = CameraPublisher::open(&config(own(), &[]), &names, host_clock()).unwrap();
+        let to_host = if is_direct { host.endpoints() } else { &[] };
+        let cameras = CameraSubscriber::open(&config(Vec::new(), to_host), &names, our_clock()).unwrap();
+        // A rig with cameras of other computers has one list of addresses.
+        let rig = Publisher::open(&config(own(), to_host)).unwrap();
+        let to_rig = if is_direct { rig.endpoints() } else { &[] };
         let interests = Interests { views: Views::All, people: true, stats: true, ..Interests::default() };
-        let viewer = Subscriber::open(&config, &interests).unwrap();
+        let viewer = Subscriber::open(&config(Vec::new(), to_rig), &interests).unwrap();
         viewer.request_viewpoint(&camera("mine", Lens::PINHOLE), 30.0).unwrap();
         let bytes = encoded(20_000).bytes;
         let template = flyrig_stream::template_hash(&bytes);
@@ -133,7 +139,7 @@ impl Parties {
 fn restart_router(times: u32) {
     let endpoint = free_endpoint();
     let mut router = Router::start(&endpoint);
-    let mut parties = Parties::open(&endpoint);
+    let mut parties = Parties::open(Some(&endpoint));
     parties.flow();
     let mut longest = Duration::ZERO;
     for round in 0..times {
@@ -151,6 +157,14 @@ fn restart_router(times: u32) {
         assert_eq!(flyrig_stream::template_hash(&template), parties.template);
     }
     println!("{times} times: everything again within {longest:.2?}");
+}
+
+#[test]
+fn without_a_router_everything_flows_directly() {
+    let mut parties = Parties::open(None);
+    parties.flow();
+    let came = parties.flow();
+    assert!(came.iter().all(|after| *after <= AGAIN), "{came:?}");
 }
 
 #[test]
