@@ -346,6 +346,7 @@ mod tests {
             frame: 7,
             capture_nanos: 0,
             publish_unix_nanos: 0,
+            publish_nanos: 0,
             host: 0,
             publisher: 0,
             width,

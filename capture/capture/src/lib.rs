@@ -68,7 +68,7 @@ pub use recording::{
 pub use rgb::{to_rgb8, to_rgb8_into};
 pub use source::{CameraSource, NetworkHealth, SourceHealth};
 pub use stage::FrameStage;
-pub use threads::{CameraStats, CaptureThreads, Pacing, SourceOpener, ThreadsConfig};
+pub use threads::{CameraStats, CaptureThreads, FrameRate, Pacing, SourceOpener, ThreadsConfig};
 #[cfg(target_os = "linux")]
 pub use v4l2::{BusPlan, CameraNode, CameraReport, FormatReport, UsbPlace, V4l2Camera, camera_reports, plan_buses};
 pub use video::{VideoOptions, VideoReplay};

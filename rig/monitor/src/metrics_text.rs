@@ -88,10 +88,13 @@ const CAMERA_COUNTERS: [Counter; 12] = [
     }),
 ];
 
-const CAMERA_GAUGES: [Gauge; 9] = [
+const CAMERA_GAUGES: [Gauge; 10] = [
     ("quiet_seconds", "Since the last frame.", |c| c.quiet_s),
     ("interval_seconds", "Mean time between captures.", |c| {
         (c.is_up() && c.interval_ms > 0.0).then_some(c.interval_ms / 1e3)
+    }),
+    ("rate_ratio", "Rate of captures over that of the camera's mode.", |c| {
+        c.stats.rate.filter(|_| c.is_up()).map(|rate| rate.ratio())
     }),
     ("moved_pixels", "How far its image lies from where it was calibrated; 0: it was not moved.", |c| match c.watch {
         WatchState::Unknown => None,
@@ -226,6 +229,7 @@ mod tests {
             "flyrig_camera_errors_total{camera=\"le\\\"ft\",kind=\"Corrupt\"} 2",
             "flyrig_sets_total{kind=\"partial\"} 10",
             "flyrig_lateness_seconds{camera=\"le\\\"ft\"} 0.012",
+            "flyrig_rate_ratio{camera=\"le\\\"ft\"} 0.5",
             "flyrig_clock_drift_ppm{camera=\"le\\\"ft\"} -12.5",
             "flyrig_stage_seconds{stage=\"draw\",quantile=\"0.95\"} 0.004",
             "flyrig_resident_bytes 2097152",
@@ -290,6 +294,7 @@ mod tests {
         for quiet_s in [Some(60.0), None] {
             health.cameras[0].quiet_s = quiet_s;
             assert!(has(&health, "flyrig_camera_up{camera=\"le\\\"ft\"} 0"));
+            assert!(!has(&health, "flyrig_rate_ratio{"));
             assert!(!has(&health, "flyrig_lateness_seconds{") && !has(&health, "flyrig_interval_seconds{"));
         }
         // A status of another computer may hold any number.

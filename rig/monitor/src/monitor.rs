@@ -22,6 +22,7 @@ use flyrig_types::CameraId;
 use crate::{
     metrics_text::{self, KeyDays},
     page_server::PageServer,
+    rate_watch::RateWatch,
     table,
 };
 
@@ -56,6 +57,7 @@ pub struct Monitor {
     logged: BTreeMap<String, (u64, bool)>,
     /// Cameras that were reported as silent.
     silent: BTreeSet<CameraId>,
+    rates: RateWatch,
     /// Status that the service manager has.
     status: String,
     /// Folder of the rig's keys; empty without keys.
@@ -80,8 +82,8 @@ impl Monitor {
             let health = Health { resident_mib: resident_mib(), ..Health::default() };
             metrics.publish(metrics_text::prometheus(&health, None, KeyDays::default()));
         }
-        let (reported, watchdog, logged, silent, status, keys, key_days) = Default::default();
-        Ok(Self { metrics, show_table, reported, watchdog, logged, silent, status, keys, key_days })
+        let (reported, watchdog, logged, silent, rates, status, keys, key_days) = Default::default();
+        Ok(Self { metrics, show_table, reported, watchdog, logged, silent, rates, status, keys, key_days })
     }
 
     /// Shows when the keys in this folder end, if it is not empty.
@@ -163,6 +165,9 @@ impl Monitor {
                 None if self.silent.remove(name) => tracing::info!("camera {name}: frames come again"),
                 _ => {}
             }
+        }
+        for change in self.rates.changes(health) {
+            change.log();
         }
         for (thread, restarts) in table::thread_restarts(health) {
             let logged = self.logged.entry(thread.clone()).or_default();

@@ -18,7 +18,7 @@ use crate::{
     header::{Header, MessageKind, empty_header},
     keys,
     session::{
-        config::{LARGEST_QUESTION, TransportConfig},
+        config::{LARGEST_QUESTION, Side, TransportConfig},
         opening::{self, Opened},
     },
     topic::{Body, PublishOutcome, Topic, TopicCounts},
@@ -64,7 +64,7 @@ impl CameraPublisher {
             keys::check_name("camera", camera.as_str())?;
             check_right(config, camera)?;
         }
-        let Opened { session, endpoints, .. } = opening::open(config, LARGEST_QUESTION, &[])?;
+        let Opened { session, endpoints, .. } = opening::open(config, Side::Sender, LARGEST_QUESTION, &[])?;
         let host = session.zid().to_string();
         let host = config.key.as_ref().map_or(host.clone(), |key| keys::session_name(&key.topic_name, &host));
         let lane = |camera: &CameraId| {

@@ -24,7 +24,7 @@ use crate::{
     json::MAX_JSON_BYTES,
     keys,
     session::{
-        config::{LARGEST_QUESTION, TransportConfig},
+        config::{LARGEST_QUESTION, Side, TransportConfig},
         opening::{self, Opened},
     },
     topic::lock,
@@ -71,7 +71,8 @@ impl CameraSubscriber {
         for camera in cameras {
             keys::check_name("camera", camera.as_str())?;
         }
-        let Opened { session, gate, .. } = opening::open(config, MAX_FRAME_BYTES + LARGEST_QUESTION, &[Role::Cameras])?;
+        let Opened { session, gate, .. } =
+            opening::open(config, Side::Receiver, MAX_FRAME_BYTES + LARGEST_QUESTION, &[Role::Cameras])?;
         let failed = |error: zenoh::Error| TransportError::session(format!("cameras of rig {rig}"), &error);
         let shared = Arc::new(Shared {
             rig: rig.clone(),

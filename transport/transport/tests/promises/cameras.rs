@@ -42,7 +42,7 @@ fn subscriber(rig: &str, cameras: &[&str], endpoints: &[String]) -> CameraSubscr
     CameraSubscriber::open(&config, &cameras, our_clock()).unwrap()
 }
 
-fn frame(camera: &str, sequence: u64) -> Frame {
+pub fn frame(camera: &str, sequence: u64) -> Frame {
     let (format, bytes) = match sequence % 2 {
         0 => (PixelFormat::Mjpeg, vec![sequence as u8; 3000 + sequence as usize]),
         _ => (PixelFormat::Yuyv, vec![sequence as u8; 4 * 2 * 2]),
@@ -222,6 +222,7 @@ fn good_header(sequence: u64) -> FrameHeader {
             frame: sequence,
             capture_nanos: host_clock().now_nanos(),
             publish_unix_nanos: 0,
+            publish_nanos: 0,
             host: 1,
             publisher: 0x666,
             width: 4,
