@@ -65,7 +65,9 @@ impl ImportedCamera {
 }
 
 impl Imported {
-    pub(crate) fn new(cameras: Vec<ImportedCamera>, up: Option<DVec3>) -> Self {
+    /// Returns cameras of a file that raised no warnings. `up` is a unit vector against gravity, world axes, where it is known.
+    #[must_use]
+    pub fn new(cameras: Vec<ImportedCamera>, up: Option<DVec3>) -> Self {
         Self { cameras, up, warnings: Vec::new() }
     }
 
