@@ -21,11 +21,19 @@ pub fn load(path: &Path) -> Result<SimConfig> {
     parse(&text).with_context(in_file)
 }
 
-/// Reads and checks a text.
+/// Reads and checks a text; of a `rig.toml` from before the simulator had a file of its own, the table `[sim]`.
 ///
 /// # Errors
 /// Names the key, its value and what is expected.
 pub fn parse(text: &str) -> Result<SimConfig> {
+    let older = text.parse().ok().and_then(|table: toml::Table| table.get("sim")?.as_table().cloned());
+    let older = older.map(|table| toml::to_string(&table)).transpose()?;
+    if older.is_some() {
+        tracing::warn!(
+            "the table [sim] of an older rig.toml is read; move its keys to a file of their own, without `sim.`"
+        );
+    }
+    let text = older.as_deref().unwrap_or(text);
     let config: SimConfig =
         toml::from_str(text).map_err(|error| toml_errors::explain::<SimConfig>(text, &error, &toml::Table::new()))?;
     config.validate()?;
@@ -43,6 +51,15 @@ mod tests {
         let all = toml::Table::try_from(SimConfig::default()).unwrap();
         let printed: toml::Table = DEFAULT_TOML.parse().unwrap();
         assert_eq!(toml_errors::missing_keys(&all, &printed, ""), Vec::<String>::new());
+    }
+
+    #[test]
+    fn the_table_of_an_older_rig_file_is_read() {
+        let older =
+            "[source]\nkind = \"sim\"\n[sim]\nwidth = 32\n[sim.cameras]\ncount = 1\n[sim.motion]\nkind = \"walk\"\n";
+        let expected = parse("width = 32\n[cameras]\ncount = 1\n[motion]\nkind = \"walk\"\n").unwrap();
+        assert_eq!(parse(older).unwrap(), expected);
+        assert!(parse("[sim]\nwidht = 3\n").unwrap_err().to_string().ends_with("did you mean `width`?"));
     }
 
     #[test]
