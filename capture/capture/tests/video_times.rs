@@ -64,7 +64,7 @@ impl Film<'_> {
             builder.add_stream(&CodecParameters::from(sound)).unwrap();
         }
         // To move the index to the front, FFmpeg opens the file again.
-        builder = builder.set_url(path.to_str().unwrap());
+        builder = builder.set_option("url", path.to_str().unwrap());
         for (key, value) in self.muxing {
             builder = builder.set_option(key, value);
         }

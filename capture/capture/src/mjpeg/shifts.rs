@@ -257,7 +257,7 @@ mod tests {
             assert!(now.are_shifted(Some(&before)), "{shift} from {first} on");
         }
         // Without an image before, only a shift that begins inside of a row.
-        for first in [30, 150, 212] {
+        for first in [30, 150, 252] {
             let now = levels(2, room, |mcu| if mcu >= first { 12.0 } else { 0.0 });
             assert!(now.are_shifted(None), "from {first} on");
         }
