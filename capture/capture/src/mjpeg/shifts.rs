@@ -129,8 +129,19 @@ fn follows_a_row(width: usize, counts: &[u32], has_before: bool) -> bool {
         inside.is_some_and(|share| share >= SHARE) && beside.is_some_and(|share| share <= BESIDE)
     };
     let half = 16.max(width / 2);
+    let in_row = |row: Option<usize>| {
+        row.filter(|row| *row < rows).map(|row| (counts[(row + 1) * width] - counts[row * width]) as f32)
+    };
     (0..=rows).any(|next| {
         let row = next.checked_sub(1);
+        // Most rows have too few at all.
+        let is_possible = match (in_row(row), in_row(Some(next))) {
+            (Some(upper), Some(lower)) => upper + lower >= SHARE * width as f32,
+            (upper, lower) => upper.or(lower).is_some_and(|count| has_before && count >= SHARE * half as f32),
+        };
+        if !is_possible {
+            return false;
+        }
         (SHORTEST..=width.saturating_sub(SHORTEST)).any(|column| {
             let right = share(row, column, width);
             let left = share(Some(next), 0, column);
@@ -151,6 +162,9 @@ fn follows_a_row(width: usize, counts: &[u32], has_before: bool) -> bool {
 fn is_changed_from_a_place_on(now: &Levels, before: &Levels) -> bool {
     let changes: Vec<f32> = now.means.iter().zip(&before.means).map(|(now, before)| now - before).collect();
     let (mut counts, mut jumps) = (Vec::with_capacity(changes.len() + 1), Vec::new());
+    let mut sorted = changes.clone();
+    sorted.sort_unstable_by(f32::total_cmp);
+    let below = |value: f32| sorted.partition_point(|change| *change < value);
     // Anywhere in a row, or by precisely one value and with a sharp edge at its ends as well: a light that was switched on
     // between two rows changes each thing by a value of its own.
     let wide = [2.0f32, 4.0, 8.0, 16.0, 32.0, 64.0].into_iter().map(|least| (least, 2.5 * least, false));
@@ -159,17 +173,20 @@ fn is_changed_from_a_place_on(now: &Levels, before: &Levels) -> bool {
     let narrow = narrow.map(|value| (0.9 * value - 0.7, 1.1 * value + 0.7, true));
     wide.chain(narrow).any(|(least, most, is_narrow)| {
         [1.0, -1.0].iter().any(|sign| {
+            // Without most of a row behind the place and of a quarter before it, there is none.
+            let changed = if *sign > 0.0 { below(most) - below(least) } else { below(-least) - below(-most) };
+            let unchanged = below(least / 2.0) - below(-least / 2.0);
+            if (changed as f32) < SHARE * now.across as f32 || (unchanged as f32) < SHARE * (now.across / 4) as f32 {
+                return false;
+            }
             // MCUs before each one that changed so, and that did not change.
             let mut sums = [0u32; 2];
             counts.clear();
             counts.push(sums);
             for change in changes.iter().map(|change| sign * change) {
-                sums[0] += u32::from((least..most).contains(&change));
-                sums[1] += u32::from(change.abs() < least / 2.0);
+                sums[0] += u32::from((least..=most).contains(&change));
+                sums[1] += u32::from(change.abs() <= least / 2.0);
                 counts.push(sums);
-            }
-            if 2 * (sums[0] as usize) < now.across {
-                return false;
             }
             // Upper edges before each one that jump by at least half of it.
             jumps.clear();
