@@ -118,7 +118,7 @@ fn escape(text: &str, most: usize) -> Cow<'_, str> {
     Cow::Owned(shown)
 }
 
-/// Returns whether a terminal would obey a character, or show nothing in its place.
+/// Returns whether a terminal would obey a character instead of showing it.
 pub(crate) fn is_obeyed(char: char) -> bool {
     char.is_control()
         || matches!(char, '\u{61c}' | '\u{200e}' | '\u{200f}' | '\u{2028}'..='\u{202e}' | '\u{2066}'..='\u{2069}')
