@@ -66,7 +66,9 @@ pub fn shorten_values(text: &str) -> Cow<'_, str> {
         rest = &after[end + 1..];
     }
     short.push_str(rest);
-    let is_long = |word: &str| word.chars().nth(MAX_VALUE).is_some() && !word.contains('/') && !word.contains(":\\");
+    // A cut value has its quotes and a comma.
+    let most = MAX_VALUE + 4;
+    let is_long = |word: &str| word.chars().nth(most).is_some() && !word.contains('/') && !word.contains(":\\");
     let words = short.split_inclusive(char::is_whitespace).map(|word| match word.trim_end() {
         long if is_long(long) => shortened(long) + &word[long.len()..],
         _ => Cow::Borrowed(word),
