@@ -71,11 +71,22 @@ pub fn load_lenses(
 ) -> Result<Vec<(CameraId, Intrinsics)>, CalibError> {
     let path = dir.join(calibration_file::FILE);
     if !path.is_file() {
-        return easymocap::load_lenses(dir, image_size);
+        return easymocap::load_lenses(dir, image_size).and_then(|lenses| with_good_names(dir, lenses));
     }
-    let lenses = calibration_file::parse(&path, &calibration_file::read(&path)?)?.lenses();
+    let lenses = with_good_names(&path, calibration_file::parse(&path, &calibration_file::read(&path)?)?.lenses())?;
     check_sizes(&path, lenses.iter().map(|(id, intrinsics)| (id, intrinsics)), image_size)?;
     Ok(lenses)
+}
+
+/// Checks the names of cameras whose poses may be missing; those of a rig are checked with it.
+fn with_good_names(
+    path: &Path,
+    lenses: Vec<(CameraId, Intrinsics)>,
+) -> Result<Vec<(CameraId, Intrinsics)>, CalibError> {
+    match lenses.iter().find_map(|(id, _)| id.check().err()) {
+        Some(error) => Err(CalibError::Camera { path: path.to_owned(), source: error.into() }),
+        None => Ok(lenses),
+    }
 }
 
 fn check_sizes<'a>(

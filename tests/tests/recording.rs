@@ -1,7 +1,11 @@
 //! Recordings: recorded frames are replayed bit for bit and exported.
 #![allow(clippy::unwrap_used, clippy::panic)] // a test may fail by panicking, in its helpers too
 
+use std::time::Duration;
+
+use flyrig_capture::{CameraSource, CaptureError, CaptureErrorKind, Note, Recorder};
 use flyrig_tests::run;
+use flyrig_types::{CameraId, Frame, Image, PixelFormat};
 
 const PROGRAM: &str = env!("CARGO_BIN_EXE_flyrig-under-test");
 
@@ -43,6 +47,102 @@ fn a_recording_is_replayed_to_the_bit_and_exported() {
     let nothing = command(&["replay", "rig.toml"]);
     assert_eq!(nothing.code, Some(1));
     assert!(nothing.stderr.contains("rig.toml is no recording"), "{}", nothing.stderr);
+}
+
+/// Writes a recording of one frame whose camera has this name.
+fn record_one(path: &std::path::Path, name: &str) {
+    // foxglove `Log`: field 3 is the message.
+    let length = u8::try_from(name.len().min(127)).unwrap();
+    let payload = [&[3 << 3 | 2, length], &name.as_bytes()[..usize::from(length)]].concat();
+    let schema = ("foxglove.Log".to_owned(), "protobuf".to_owned(), Vec::new());
+    let note = Note { topic: "cameras".to_owned(), schema, payload };
+    let recorder = Recorder::create(path, &[note], None).unwrap();
+    let mut tap = recorder.tap(OneFrame(name.into(), false)).unwrap();
+    assert!(tap.next_frame(Duration::ZERO).is_ok());
+    drop(tap);
+    assert_eq!(recorder.finish().frames, 1);
+}
+
+struct OneFrame(CameraId, bool);
+
+impl CameraSource for OneFrame {
+    fn camera(&self) -> &CameraId {
+        &self.0
+    }
+
+    fn next_frame(&mut self, _timeout: Duration) -> Result<Frame, CaptureError> {
+        if std::mem::replace(&mut self.1, true) {
+            return Err(CaptureError::new(&self.0, CaptureErrorKind::EndOfStream, "over"));
+        }
+        let image = Image::new(4, 2, PixelFormat::Rgb8, vec![9; 24]).unwrap();
+        let camera = self.0.clone();
+        Ok(Frame { camera, sequence: 0, capture_nanos: 1_000_000_000, exposure_nanos: None, image, mask: None })
+    }
+}
+
+#[test]
+fn a_recording_whose_cameras_leave_their_folder_is_refused_and_nothing_is_written() {
+    let folder = tempfile::tempdir().unwrap();
+    let inside = folder.path().join("deep/er");
+    std::fs::create_dir_all(&inside).unwrap();
+    let absolute = folder.path().join("absolute").display().to_string();
+    let names = ["../../x", &absolute, "..", ".", "a\u{1b}[2J", "", &"x".repeat(100), "a\\b"];
+    for name in names {
+        record_one(&inside.join("evil.mcap"), name);
+        let of = |args: &[&str]| run(PROGRAM, args, &inside).unwrap();
+        let eval = ["eval", "evil.mcap", "--inputs", name, "--holdout", "b", "--pose", "estimated", "--out", "out"];
+        for finished in [of(&["replay", "evil.mcap", "--export", "out"]), of(&eval)] {
+            assert_eq!(finished.code, Some(1), "{name:?}: {finished:?}");
+            assert_eq!(finished.stderr.lines().count(), 1, "{finished:?}");
+            assert!(!finished.stderr.contains('\u{1b}') && finished.stderr.len() < 500, "{finished:?}");
+        }
+        let export = of(&["replay", "evil.mcap", "--export", "out"]);
+        assert!(export.stderr.contains("evil.mcap: the camera name '"), "{}", export.stderr);
+        std::fs::remove_file(inside.join("evil.mcap")).unwrap();
+        assert_eq!(std::fs::read_dir(&inside).unwrap().count(), 0, "{name:?}");
+        assert_eq!(std::fs::read_dir(folder.path()).unwrap().count(), 1, "{name:?}");
+    }
+    record_one(&inside.join("good.mcap"), "front left");
+    let good = run(PROGRAM, &["replay", "good.mcap", "--export", "out"], &inside).unwrap();
+    assert_eq!(good.code, Some(0), "{good:?}");
+    assert!(inside.join("out/images/front left/000000.png").exists());
+}
+
+#[test]
+fn calibrations_data_sets_and_configurations_with_such_names_are_refused() {
+    let folder = tempfile::tempdir().unwrap();
+    let at = |name: &str| folder.path().join(name);
+    let toml = |name: &str| {
+        let name = toml::Value::String(name.to_owned());
+        format!(
+            "version = 1\nup = [0.0, 0.0, 1.0]\n[[cameras]]\nname = {name}\nsize = [64, 48]\nfocal_px = [60.0, 60.0]\n\
+             center_px = [31.5, 23.5]\nlens = {{ model = \"fisheye\", coefficients = [0.0, 0.0, 0.0, 0.0] }}\n\
+             rotation = [[1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]]\ntranslation_m = [0.0, 1.2, 3.0]\n"
+        )
+    };
+    let of = |args: &[&str]| run(PROGRAM, args, folder.path()).unwrap();
+    for name in ["../../x", "/tmp/x", "..", "a\u{1b}[2J", "", &"x".repeat(300)] {
+        std::fs::write(at("calibration.toml"), toml(name)).unwrap();
+        let convert = of(&["calibrate", "convert", "calibration.toml", "--to", "easymocap", "--out", "out"]);
+        let cameras = toml::Value::Array(vec![toml::Value::String(name.to_owned())]);
+        std::fs::write(at("rig.toml"), format!("[source]\nkind = \"mcap\"\npath = \"x\"\ncameras = {cameras}\n"))
+            .unwrap();
+        let check = of(&["config", "check", "rig.toml"]);
+        for (finished, file) in [(convert, "calibration.toml"), (check, "rig.toml")] {
+            assert_eq!(finished.code, Some(1), "{name:?}: {finished:?}");
+            assert!(finished.stderr.contains("the camera name '") && finished.stderr.contains(file), "{finished:?}");
+            assert!(!finished.stderr.contains('\u{1b}') && finished.stderr.len() < 600, "{finished:?}");
+        }
+        assert!(!at("out").exists());
+    }
+    std::fs::create_dir_all(at("take/images/a\u{1b}[2J")).unwrap();
+    let sync = of(&["sync-check", "take"]);
+    assert_eq!(sync.code, Some(1), "{sync:?}");
+    assert!(sync.stderr.contains("take/images: the camera name 'a\\u{1b}[2J'"), "{}", sync.stderr);
+    let long = "y".repeat(3000);
+    std::fs::write(at("rig.toml"), format!("[sync]\nwindow_ms = \"{long}\"\n")).unwrap();
+    let check = of(&["config", "check", "rig.toml"]);
+    assert!(check.stderr.contains("rig.toml") && !check.stderr.contains(&long[..101]), "{}", check.stderr);
 }
 
 #[test]

@@ -83,7 +83,8 @@ pub fn summary(recorded: &Recorded, path: &Path) -> Result<String> {
         text += &format!(", as JPEG; {:.1} MB as the cameras sent them", recorded.bytes_sent as f64 / 1e6);
     }
     if recorded.dropped > 0 {
-        text += &format!("; {} more were dropped because compressing them took too long", recorded.dropped);
+        text +=
+            &format!("; {} more were dropped: compressing them took too long, or the disk was full", recorded.dropped);
     }
     match &recorded.problem {
         Some(problem) => bail!("the recording broke off after {text}: {problem}"),
@@ -123,7 +124,7 @@ impl RigRecording {
 /// Runs `flyrig record`.
 pub fn record(config: &Config, args: &RecordArgs, gpu: Option<&GpuContext>) -> Result<()> {
     let stop = stop::flag();
-    let mut monitor = Monitor::start(&config.health.listen, false)?;
+    let mut monitor = Monitor::start(&config.health.listen, false)?.with_keys(&config.transport.keys);
     let take = open_recorded(config, gpu)?;
     let (pacing, rig) = (take.pacing(), take.calibration.map(|calibration| calibration.rig));
     let ids: Vec<CameraId> = take.sources.iter().map(|camera| camera.camera().clone()).collect();

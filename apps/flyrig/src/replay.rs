@@ -9,7 +9,7 @@ use std::{
 
 use anyhow::{Result, ensure};
 use clap::Args;
-use flyrig_calib::save_export;
+use flyrig_calib::{save_export, save_lenses};
 use flyrig_capture::{CaptureThreads, FolderOptions, Pacing, PopError, ThreadsConfig, to_rgb8};
 use flyrig_report::{png, stop, write_whole};
 use flyrig_sync::{SyncSettings, Synchronizer};
@@ -17,7 +17,7 @@ use flyrig_takes::{
     Footage,
     recorded::{RecordedCameras, recorded_cameras},
 };
-use flyrig_types::{CameraId, Frame, FrameSet, PixelFormat, Rig};
+use flyrig_types::{CameraId, Frame, FrameSet, Intrinsics, PixelFormat, Rig};
 
 use crate::{arguments::LagArgs, pose_recording};
 
@@ -36,7 +36,9 @@ pub struct ReplayArgs {
 /// Runs the command.
 pub fn replay(args: &ReplayArgs) -> Result<()> {
     stop::flag();
-    let RecordedCameras { ids, rig } = recorded_cameras(&args.recording)?;
+    let recorded = recorded_cameras(&args.recording)?;
+    recorded.log_notes(&args.recording);
+    let RecordedCameras { ids, rig, lenses, .. } = recorded;
     for camera in args.lags.cameras() {
         let known: Vec<&str> = ids.iter().map(CameraId::as_str).collect();
         let is_known = known.contains(&camera.as_str());
@@ -49,7 +51,7 @@ pub fn replay(args: &ReplayArgs) -> Result<()> {
     let footage = Footage::Recording(args.recording.clone());
     let threads = CaptureThreads::start(footage.open(Some(&ids), &FolderOptions::default())?.sources, threads_config)?;
     if let Some(folder) = &args.export {
-        start_export(folder, &ids, rig.as_ref())?;
+        start_export(folder, &ids, rig.as_ref(), &lenses)?;
     }
     let (tallies, digest) = play(&threads, &ids, &mut sync, args.export.as_deref())?;
     for (id, tally) in ids.iter().zip(&tallies) {
@@ -100,13 +102,19 @@ fn play(
 }
 
 /// Makes the folders of an export and writes its calibration.
-fn start_export(folder: &Path, ids: &[CameraId], rig: Option<&Rig>) -> Result<()> {
+fn start_export(folder: &Path, ids: &[CameraId], rig: Option<&Rig>, lenses: &[(CameraId, Intrinsics)]) -> Result<()> {
     ensure!(!folder.exists(), "{} is there already; name a new folder", folder.display());
     for id in ids {
         fs::create_dir_all(folder.join("images").join(id.as_str()))?;
     }
     match rig {
         Some(rig) => save_export(folder, rig)?,
+        None if !lenses.is_empty() => {
+            let lens_folder = folder.join("lenses");
+            fs::create_dir_all(&lens_folder)?;
+            save_lenses(&lens_folder, lenses)?;
+            println!("the recording has lenses only; they are in {}", lens_folder.display());
+        }
         None => println!("the recording has no calibration, so neither has {}", folder.display()),
     }
     Ok(())

@@ -1,6 +1,7 @@
 //! Errors of TOML files, with the key that is wrong and the one that was probably meant.
 
 use anyhow::anyhow;
+use flyrig_types::shortened;
 use serde::de::DeserializeOwned;
 
 /// Explains why `text` is no `T`: names the line and the key, and the known key nearest to an unknown one. `all` holds every table with
@@ -16,9 +17,16 @@ pub fn explain<T: DeserializeOwned>(text: &str, error: &toml::de::Error, all: &t
     };
     let hint = nearest_key(error.message(), all).map(|key| format!("did you mean `{key}`?")).unwrap_or_default();
     match place {
-        "" => anyhow!("{}{hint}", error.to_string().trim_end_matches(' ')),
+        "" => anyhow!("{}{hint}", short_lines(error.to_string().trim_end_matches(' '))),
         place => anyhow!("{place}: {}\n{hint}", error.message()),
     }
+}
+
+/// Shortens the lines that an error repeats from the file, which it marks with a bar.
+fn short_lines(text: &str) -> String {
+    let is_repeated = |line: &str| line.trim_start_matches(|c: char| c.is_ascii_digit() || c == ' ').starts_with('|');
+    let short = |line| if is_repeated(line) { shortened(line) } else { line.into() };
+    text.split('\n').map(short).collect::<Vec<_>>().join("\n")
 }
 
 /// Returns the line and name of the key that makes the table whose header is at `start` invalid, and its error.

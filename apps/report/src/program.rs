@@ -4,6 +4,7 @@ use std::{io::IsTerminal as _, process::ExitCode};
 
 use anyhow::Result;
 use flyrig_gpu::{AdapterChoice, GpuContext};
+use flyrig_types::{escape_controls, shorten_values};
 use tracing_subscriber::EnvFilter;
 
 /// Opens the graphics adapter with this text in its name, or the fastest one.
@@ -55,7 +56,8 @@ pub fn exit_code(result: Result<()>) -> ExitCode {
     }
 }
 
-/// Joins an error and its causes, without causes that the text already contains.
+/// Joins an error and its causes, without causes that the text already contains. Errors repeat the content of foreign files: what a
+/// terminal would obey is escaped, but for line breaks, and quoted values are cut at 100 characters.
 #[must_use]
 pub fn one_line(error: &anyhow::Error) -> String {
     let mut line = String::new();
@@ -66,5 +68,6 @@ pub fn one_line(error: &anyhow::Error) -> String {
             line = format!("{line}: {cause}");
         }
     }
-    line
+    let line = line.split('\n').map(escape_controls).collect::<Vec<_>>().join("\n");
+    shorten_values(&line).into_owned()
 }

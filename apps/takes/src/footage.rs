@@ -21,7 +21,7 @@ use crate::{dataset, recorded::recorded_cameras};
 pub enum Footage {
     /// Folder in EasyMocap's layout, with `images/CAM/*`.
     Folder(PathBuf),
-    /// File of `flyrig record`.
+    /// File of `flyrig record`, or MCAP file of another program.
     Recording(PathBuf),
     /// Video files, one per camera, each named after its camera.
     Videos(Vec<PathBuf>),
@@ -79,7 +79,14 @@ impl Footage {
     pub fn load_rig(&self, chosen: &[CameraId]) -> Result<Rig> {
         match self {
             Self::Folder(root) => dataset::load_rig(root, chosen),
-            Self::Recording(path) => recorded_cameras(path)?.calibrated(path),
+            Self::Recording(path) => {
+                let recorded = recorded_cameras(path)?;
+                // The error says what is missing.
+                if recorded.rig.is_some() {
+                    recorded.log_notes(path);
+                }
+                recorded.calibrated(path)
+            }
             Self::Videos(_) => anyhow::bail!("videos have no calibration of their own; name its folder"),
         }
     }
@@ -96,17 +103,19 @@ impl Footage {
                 Ok(OpenFootage { sources: sources.into_iter().map(boxed).collect(), frames })
             }
             Self::Recording(path) => {
-                let open = |id: &CameraId| Ok(boxed(McapReplay::open(id, path)?));
-                let sources = match cameras {
-                    Some(ids) => ids.iter().map(open).collect::<Result<_>>()?,
-                    None => recorded_cameras(path)?.ids.iter().map(open).collect::<Result<_>>()?,
-                };
+                let recorded = recorded_cameras(path)?;
+                let ids = cameras.unwrap_or(&recorded.ids);
+                let open = |id: &CameraId| Ok(boxed(McapReplay::open_camera(&recorded.images_of(id), path)?));
+                let sources = ids.iter().map(open).collect::<Result<_>>()?;
                 Ok(OpenFootage { sources, frames: 0 })
             }
             Self::Videos(files) => {
                 let open = |(id, file): (CameraId, &PathBuf)| {
                     Ok(boxed(VideoReplay::open(&id, file, &VideoOptions::default())?))
                 };
+                for file in files {
+                    video_camera(file).check().with_context(|| file.display().to_string())?;
+                }
                 let all = files.iter().map(|file| (video_camera(file), file));
                 let sources = match cameras {
                     None => all.map(open).collect::<Result<_>>()?,

@@ -87,6 +87,7 @@ impl Take {
             Footage::Folder(root) if needs_calibration => Self::open_folder(root, footage, options, folder_options),
             Footage::Recording(path) => {
                 let cameras = recorded_cameras(path)?;
+                cameras.log_notes(path);
                 let take = Self::from_sources(ready(footage.open(Some(&cameras.ids), &folder_options)?.sources));
                 Ok(Self { calibration: cameras.rig.map(Calibration::without_plates), ..take })
             }

@@ -4,7 +4,7 @@ use std::{collections::BTreeMap, ops::Range, path::PathBuf};
 
 use anyhow::{Context, Result, bail};
 use flyrig_body::{Outfit, ShapeParams, default_template, load_gltf};
-use flyrig_capture::recorded_spans;
+use flyrig_capture::{RecordedCamera, recorded_spans};
 use flyrig_fusion::{
     EstimatedPerception, GivenPerception, GivenPerson, Origin, PerceptionSettings, PersonId, SHAPE_SECS, SHAPE_SETS,
     Session, SessionBuilder, SessionSettings,
@@ -18,6 +18,7 @@ use crate::{
     footage::Footage,
     frame_sets::{FrameSelection, FrameSets},
     known_avatar::KnownBody,
+    recorded::recorded_cameras,
     true_joints::TrueJoints,
     truth::TruthReader,
 };
@@ -238,7 +239,9 @@ fn measure_recording(settings: &ReplaySettings, rig: &Rig) -> Result<(f64, usize
         bail!("the recording {path} holds no body; leave --shape out, or use a folder with a glTF file");
     }
     let ids: Vec<CameraId> = rig.cameras.iter().map(|camera| camera.id.clone()).collect();
-    let spans = recorded_spans(&settings.dataset, &ids)?;
+    let recorded = recorded_cameras(&settings.dataset)?;
+    let images: Vec<RecordedCamera> = ids.iter().map(|id| recorded.images_of(id)).collect();
+    let spans = recorded_spans(&settings.dataset, &images)?;
     let Some(longest) = spans.iter().max_by_key(|span| span.frames).filter(|span| span.frames > 0) else {
         bail!("the recording {path} holds no image of the cameras {}", settings.inputs.join(", "));
     };

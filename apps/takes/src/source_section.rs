@@ -5,7 +5,7 @@ use std::{
     path::{Path, PathBuf},
 };
 
-use anyhow::{Result, ensure};
+use anyhow::{Context as _, Result, ensure};
 use flyrig_capture::{DeviceSettings, Pacing};
 use flyrig_fusion::InputFormat;
 use flyrig_types::{CameraId, Rig};
@@ -134,6 +134,7 @@ impl SourceSection {
     pub fn validate(&self) -> Result<()> {
         for (i, entry) in self.cameras.iter().enumerate() {
             let name = entry.name();
+            CameraId::from(name).check().context("in source.cameras")?;
             ensure!(
                 self.cameras[..i].iter().all(|before| before.name() != name),
                 "camera {name} is listed twice in source.cameras"

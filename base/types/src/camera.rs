@@ -3,7 +3,7 @@
 use glam::{DMat3, DVec2, DVec3};
 use serde::{Deserialize, Serialize};
 
-use crate::{CameraId, ColorMatch, Isometry};
+use crate::{CameraId, CameraNameError, ColorMatch, Isometry};
 
 /// Largest side of an image, pixels.
 pub const MAX_IMAGE_SIDE: u32 = 16_384;
@@ -258,6 +258,9 @@ pub enum CameraError {
         /// Permitted range.
         expected: &'static str,
     },
+    /// No camera may have this name.
+    #[error(transparent)]
+    Name(#[from] CameraNameError),
     /// Two cameras have one name.
     #[error("camera {0} appears twice in the rig")]
     Duplicate(CameraId),
@@ -365,11 +368,12 @@ impl Camera {
         camera
     }
 
-    /// Checks all numbers.
+    /// Checks the name ([`CameraId::check`]) and all numbers.
     ///
     /// # Errors
     /// [`CameraError`] names camera and field.
     pub fn validate(&self) -> Result<(), CameraError> {
+        self.id.check()?;
         let camera = || self.id.clone();
         let i = &self.intrinsics;
         let not_finite = |field| CameraError::NotFinite { camera: camera(), field };
@@ -449,16 +453,6 @@ impl Rig {
     #[must_use]
     pub fn slot(&self, id: &CameraId) -> Option<usize> {
         self.cameras.iter().position(|camera| camera.id == *id)
-    }
-
-    /// Returns the world axis closest to "up" in the cameras' images, for data sets that do not state it.
-    #[must_use]
-    pub fn guess_world_up(cameras: &[Camera]) -> DVec3 {
-        let up: DVec3 = cameras.iter().map(|c| c.camera_from_world.rotation.inverse() * DVec3::NEG_Y).sum();
-        [DVec3::Z, DVec3::Y, DVec3::X, DVec3::NEG_Z, DVec3::NEG_Y, DVec3::NEG_X]
-            .into_iter()
-            .max_by(|a, b| up.dot(*a).total_cmp(&up.dot(*b)))
-            .unwrap_or(DVec3::Z)
     }
 }
 
@@ -578,10 +572,5 @@ mod tests {
         let good = camera(Lens::PINHOLE);
         let rig = Rig { cameras: vec![good.clone(), good], world_up: DVec3::Z };
         assert_eq!(rig.validate().unwrap_err(), CameraError::Duplicate("a".into()));
-    }
-
-    #[test]
-    fn up_is_guessed_from_level_cameras() {
-        assert_eq!(Rig::guess_world_up(&[camera(Lens::PINHOLE)]), DVec3::Z);
     }
 }

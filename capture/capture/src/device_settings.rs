@@ -86,9 +86,9 @@ impl DeviceSettings {
             }
             Err(self.wrong(format!("{key} is {value}, it must lie between {low} and {high}")))
         };
-        if self.name.is_empty() {
-            return Err(CaptureError::general(CaptureErrorKind::Unsupported, "a camera has an empty name"));
-        }
+        CameraId::from(self.name.as_str())
+            .check()
+            .map_err(|error| CaptureError::general(CaptureErrorKind::Unsupported, error.to_string()))?;
         self.options()?;
         range("size[0]", f64::from(self.size[0]), 16.0, 16_384.0)?;
         range("size[1]", f64::from(self.size[1]), 16.0, 16_384.0)?;

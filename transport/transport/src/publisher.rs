@@ -23,7 +23,7 @@ use crate::{
     people::person_stream::{PersonMessage, PublishedPeople, answer_templates},
     printable::printable,
     session::{
-        config::{LARGEST_QUESTION, TransportConfig},
+        config::{LARGEST_QUESTION, Side, TransportConfig},
         opening::{self, Opened},
     },
     stats::RigStats,
@@ -93,7 +93,7 @@ impl Publisher {
         config.validate()?;
         let rig = &config.rig;
         let Opened { session, endpoints, gate } =
-            opening::open(config, LARGEST_QUESTION, &[Role::Viewer, Role::Relay])?;
+            opening::open(config, Side::Sender, LARGEST_QUESTION, &[Role::Viewer, Role::Relay])?;
         let failed = |error: zenoh::Error| TransportError::session(format!("publisher of rig {rig}"), &error);
 
         let splats = Arc::new(Topic::new("splats".to_owned(), "splats".to_owned(), MessageKind::Splats));

@@ -2,14 +2,16 @@
 
 use std::collections::BTreeMap;
 
-use flyrig_types::{CameraId, Frame, Image, PixelFormat};
+use flyrig_types::{CameraId, Frame, Image, PixelFormat, shortened};
 use foxglove::{
-    Decode as _, Encode,
+    Encode,
     messages::{CompressedImage, RawImage, Timestamp},
 };
 use prost::bytes::Bytes;
 
+use super::schemas::{ImageMessage, Pixels, Schema};
 use crate::error::{CaptureError, CaptureErrorKind};
+use crate::image_file;
 use crate::mjpeg;
 
 /// Prefix of the topics of images.
@@ -37,6 +39,17 @@ const ENCODINGS: [(PixelFormat, &str); 11] = [
     (PixelFormat::BayerGrbg8, "bayer_grbg8"),
     (PixelFormat::BayerGbrg8, "bayer_gbrg8"),
     (PixelFormat::BayerBggr8, "bayer_bggr8"),
+];
+
+/// Other names that other programs use.
+const FOREIGN_ENCODINGS: [(PixelFormat, &str); 7] = [
+    (PixelFormat::Rgba8, "bgra8"),
+    (PixelFormat::Bgr8, "8UC3"),
+    (PixelFormat::Gray8, "8UC1"),
+    (PixelFormat::Uyvy, "yuv422"),
+    (PixelFormat::Yuyv, "yuv422_yuy2"),
+    (PixelFormat::Gray8, "mono"),
+    (PixelFormat::Gray8, "gray8"),
 ];
 
 fn schema<M: Encode>() -> (String, String, Vec<u8>) {
@@ -93,31 +106,79 @@ pub(super) fn exposure_nanos(metadata: &BTreeMap<String, String>) -> Option<u64>
 ///
 /// # Errors
 /// `Corrupt` for an invalid image, `Unsupported` for other kinds of messages and encodings.
-pub(super) fn decode(camera: &CameraId, schema: &str, payload: Vec<u8>) -> Result<Image, CaptureError> {
+pub(super) fn decode(
+    camera: &CameraId,
+    channel: &mcap::Channel<'_>,
+    payload: Vec<u8>,
+) -> Result<(ImageTime, Image), CaptureError> {
+    let unsupported = |text: String| CaptureError::new(camera, CaptureErrorKind::Unsupported, text);
+    let schema = match Schema::of(channel) {
+        Some(schema) => schema.map_err(unsupported)?,
+        None => return Err(not_an_image(camera, channel)),
+    };
+    if !schema.is_image() {
+        return Err(not_an_image(camera, channel));
+    }
+    let message = schema.image(payload).map_err(|text| CaptureError::new(camera, CaptureErrorKind::Corrupt, text))?;
+    Ok((ImageTime(message.stamp_nanos), to_image(camera, message)?))
+}
+
+/// Time in an image's message, nanoseconds.
+pub(super) struct ImageTime(pub i64);
+
+fn not_an_image(camera: &CameraId, channel: &mcap::Channel<'_>) -> CaptureError {
+    let name = channel.schema.as_ref().map_or("", |schema| schema.name.as_str());
+    let text =
+        format!("its messages are {:?}; expected foxglove.CompressedImage or foxglove.RawImage", shortened(name));
+    CaptureError::new(camera, CaptureErrorKind::Unsupported, text)
+}
+
+/// Decodes an image: JPEG stays as it is, PNG becomes RGB, and raw images lose the padding of their rows.
+///
+/// # Errors
+/// `Corrupt` for an invalid image, `Unsupported` for other encodings.
+pub(super) fn to_image(camera: &CameraId, message: ImageMessage) -> Result<Image, CaptureError> {
     let corrupt = |text: String| CaptureError::new(camera, CaptureErrorKind::Corrupt, text);
-    let payload = Bytes::from(payload);
-    match schema {
-        "foxglove.CompressedImage" => {
-            let image = CompressedImage::decode(payload).map_err(|error| corrupt(error.to_string()))?;
-            let Some((width, height)) = mjpeg::jpeg_size(&image.data) else {
-                return Err(corrupt(format!("an image of format {:?} that is no JPEG", image.format)));
+    let unsupported = |text: String| CaptureError::new(camera, CaptureErrorKind::Unsupported, text);
+    match message.pixels {
+        Pixels::Compressed { data, .. } if data.starts_with(b"\x89PNG") => {
+            let rgb = image_file::decode(&data).map_err(|error| error.of(camera))?.into_rgb8();
+            let (width, height) = rgb.dimensions();
+            Image::new(width, height, PixelFormat::Rgb8, rgb.into_raw()).map_err(|error| corrupt(error.to_string()))
+        }
+        Pixels::Compressed { format, data } => {
+            let Some((width, height)) = mjpeg::jpeg_size(&data) else {
+                let text = format!("an image of format {:?} that is neither JPEG nor PNG", shortened(&format));
+                return Err(corrupt(text));
             };
             let (width, height) = (width as u32, height as u32);
-            Image::new(width, height, PixelFormat::Mjpeg, Vec::from(image.data))
-                .map_err(|error| corrupt(error.to_string()))
+            Image::new(width, height, PixelFormat::Mjpeg, Vec::from(data)).map_err(|error| corrupt(error.to_string()))
         }
-        "foxglove.RawImage" => {
-            let image = RawImage::decode(payload).map_err(|error| corrupt(error.to_string()))?;
-            let Some((format, _)) = ENCODINGS.iter().find(|(_, word)| *word == image.encoding) else {
-                let text = format!("encoding {:?} cannot be read", image.encoding);
-                return Err(CaptureError::new(camera, CaptureErrorKind::Unsupported, text));
+        Pixels::Raw { width, height, encoding, step, data } => {
+            let is_bgra = encoding == "bgra8";
+            let known = ENCODINGS.iter().chain(&FOREIGN_ENCODINGS).find(|(_, word)| *word == encoding);
+            let Some((format, _)) = known else {
+                return Err(unsupported(format!("encoding {:?} cannot be read", shortened(&encoding))));
             };
-            Image::new(image.width, image.height, *format, Vec::from(image.data))
-                .map_err(|error| corrupt(error.to_string()))
-        }
-        other => {
-            let text = format!("its messages are {other:?}; expected foxglove.CompressedImage or foxglove.RawImage");
-            Err(CaptureError::new(camera, CaptureErrorKind::Unsupported, text))
+            let mut bytes = without_padding(*format, [width, height, step], data.into());
+            if is_bgra {
+                bytes.chunks_exact_mut(4).for_each(|pixel| pixel.swap(0, 2));
+            }
+            Image::new(width, height, *format, bytes).map_err(|error| corrupt(error.to_string()))
         }
     }
+}
+
+/// Removes the padding at the end of each row of `step` bytes; returns other bytes unchanged.
+fn without_padding(format: PixelFormat, [width, height, step]: [u32; 3], bytes: Vec<u8>) -> Vec<u8> {
+    let (row, rows) = match format {
+        PixelFormat::Nv12 => (width as usize, height as usize + (height as usize).div_ceil(2)),
+        format => (format.byte_len(width, 1).unwrap_or(0), height as usize),
+    };
+    let step = step as usize;
+    // The last row may come without its padding.
+    if step <= row || row == 0 || bytes.len() < step.saturating_mul(rows.saturating_sub(1)).saturating_add(row) {
+        return bytes;
+    }
+    bytes.chunks(step).take(rows).flat_map(|line| &line[..row.min(line.len())]).copied().collect()
 }

@@ -42,12 +42,14 @@ pub struct Recorded {
     pub bytes: u64,
     /// Bytes of those frames as the cameras sent them.
     pub bytes_sent: u64,
-    /// Frames that were not recorded because compression was too slow.
+    /// Frames that were not recorded because compression was too slow or the disk was full.
     pub dropped: u64,
     /// Time since the start; the duration of a recording that has ended.
     pub elapsed: Duration,
     /// Free space of the file system at the last check, bytes; `None` where that is unknown.
     pub free_bytes: Option<u64>,
+    /// Missing space, while the recording waits for it.
+    pub paused: Option<String>,
     /// Reason why the recording stopped by itself, if it did. Everything written before is readable.
     pub problem: Option<String>,
 }

@@ -12,11 +12,11 @@ use super::{
 
 /// Overhead of a message's record and its index entry, bytes.
 const MESSAGE_BYTES: u64 = 64;
-/// Metadata keys of a rotated recording's channels, which link its parts.
+/// Metadata keys of the channels, which link the parts of a recording.
 const RECORDING: &str = "recording";
 const PART: &str = "part";
 
-/// Link between the parts of a rotated recording.
+/// Link between the parts of a recording.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub(super) struct Link {
     /// Identifier shared by all parts, unique to the recording.
@@ -39,7 +39,7 @@ impl Link {
 /// File that is complete by itself, with notes, schemas and channels.
 pub(super) struct RecordingPart<D: Disk> {
     writer: Writer<D::File>,
-    link: Option<Link>,
+    link: Link,
     channels: Vec<(Arc<Channel>, u16)>,
     /// Time of the first message after the notes.
     begun: Option<Instant>,
@@ -49,8 +49,8 @@ pub(super) struct RecordingPart<D: Disk> {
 
 impl<D: Disk> RecordingPart<D> {
     /// Creates the file and writes the notes.
-    pub fn create(disk: &mut D, number: u32, notes: &[Note], link: Option<Link>) -> McapResult<Self> {
-        let target = disk.create(number)?;
+    pub fn create(disk: &mut D, notes: &[Note], link: Link) -> McapResult<Self> {
+        let target = disk.create(link.part)?;
         // Chunks are made in memory and written whole: a killed process leaves no half of one behind.
         let options = WriteOptions::new().compression(None).chunk_size(None).disable_seeking(true);
         let writer = Writer::with_options(target, options.library(concat!("flyrig ", env!("CARGO_PKG_VERSION"))))?;
@@ -72,9 +72,7 @@ impl<D: Disk> RecordingPart<D> {
     ) -> McapResult<u16> {
         let schema = self.writer.add_schema(name, encoding, data)?;
         let mut metadata = metadata.clone();
-        if let Some(link) = &self.link {
-            link.put(&mut metadata);
-        }
+        self.link.put(&mut metadata);
         // Once in the data and once in the index.
         self.bytes += 2 * (data.len() + topic.len()) as u64 + 2 * MESSAGE_BYTES;
         self.writer.add_channel(schema, topic, "protobuf", &metadata)

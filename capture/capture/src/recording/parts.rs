@@ -1,23 +1,16 @@
 //! Reader of a recording's messages over all of its files.
 
-use std::{
-    fs::File,
-    io::BufReader,
-    path::{Path, PathBuf},
-};
+use std::path::{Path, PathBuf};
 
-use mcap::{McapResult, Message, io::MessageReader, sans_io::LinearReaderOptions};
+use mcap::{McapResult, Message};
 
-use super::{disk::part_path, part::Link};
+use super::{disk::part_path, messages::Messages, part::Link};
 use crate::error::{CaptureError, CaptureErrorKind};
-
-/// Bytes per read.
-const BUFFER: usize = 1 << 20;
 
 /// Messages of a file and, when it is the first of a rotated recording, of the files after it.
 pub(super) struct Parts {
     first: PathBuf,
-    messages: MessageReader<BufReader<File>>,
+    messages: Messages,
     /// First message of a newly opened file.
     held: Option<Message<'static>>,
     /// Whether the first message was read.
@@ -26,21 +19,13 @@ pub(super) struct Parts {
     link: Option<Link>,
 }
 
-fn messages(path: &Path) -> std::io::Result<MessageReader<BufReader<File>>> {
-    let file = File::open(path)?;
-    // A damaged length must not ask for more memory than the file has bytes.
-    let length = usize::try_from(file.metadata()?.len()).unwrap_or(usize::MAX);
-    let options = LinearReaderOptions::default().with_record_length_limit(length);
-    Ok(MessageReader::new_with_options(BufReader::with_capacity(BUFFER, file), options))
-}
-
 impl Parts {
     /// Opens the first file.
     ///
     /// # Errors
     /// `NotFound` if the file is missing.
     pub fn open(path: &Path) -> Result<Self, CaptureError> {
-        let messages = messages(path).map_err(|error| {
+        let messages = Messages::open(path).map_err(|error| {
             CaptureError::general(CaptureErrorKind::NotFound, format!("{} cannot be opened: {error}", path.display()))
         })?;
         Ok(Self { first: path.to_owned(), messages, held: None, has_begun: false, link: None })
@@ -51,7 +36,7 @@ impl Parts {
         let Some(link) = &mut self.link else { return false };
         let Some(part) = link.part.checked_add(1) else { return false };
         let path = part_path(&self.first, part);
-        let Ok(mut next) = messages(&path) else { return false };
+        let Ok(mut next) = Messages::open(&path) else { return false };
         // Without a message it broke off before it began.
         let Some(Ok(message)) = next.next() else { return false };
         let wanted = Link { recording: link.recording.clone(), part };

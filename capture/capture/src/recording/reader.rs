@@ -5,11 +5,12 @@ use std::{
     time::Duration,
 };
 
-use flyrig_types::{CameraId, Frame};
+use flyrig_types::{CameraId, Frame, shortened};
 
 use super::{
     message::{self, TOPIC},
     parts::Parts,
+    schemas::Schema,
 };
 use crate::error::{CaptureError, CaptureErrorKind};
 use crate::source::CameraSource;
@@ -18,16 +19,60 @@ use crate::source::CameraSource;
 const MOST_NOTES: usize = 4096;
 const MOST_NOTE_BYTES: usize = 64 << 20;
 
+/// Camera of a recording.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct RecordedCamera {
+    /// Name.
+    pub id: CameraId,
+    /// Topic of its images.
+    pub topic: String,
+    /// Times of its frames.
+    pub times: FrameTimes,
+}
+
+impl RecordedCamera {
+    /// Returns a camera of a recording by flyrig.
+    #[must_use]
+    pub fn new(id: CameraId) -> Self {
+        Self { topic: format!("{TOPIC}{id}"), times: FrameTimes::Own, id }
+    }
+
+    fn is_foreign(&self) -> bool {
+        self.times != FrameTimes::Own
+    }
+}
+
+/// Origin of the times of frames.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum FrameTimes {
+    /// Those of flyrig's recordings, whose messages have the times of their images.
+    Own,
+    /// Times at which another program recorded the messages.
+    Logged,
+    /// Timestamps in the messages of another program.
+    Stamped,
+}
+
+impl FrameTimes {
+    fn nanos(self, log_time: u64, stamp_nanos: i64) -> i64 {
+        match self {
+            Self::Own | Self::Logged => i64::try_from(log_time).unwrap_or(i64::MAX),
+            Self::Stamped => stamp_nanos,
+        }
+    }
+}
+
 /// Frame source of one camera of a recording. Frames have the order of the file; a truncated file, as after a crash,
 /// ends there with a warning. The first file of a rotated recording ([`crate::Rotation`]) yields the frames of all its
 /// files, up to the first missing one; any other file yields its own.
 pub struct McapReplay {
-    camera: CameraId,
+    camera: RecordedCamera,
     path: PathBuf,
-    topic: String,
     messages: Parts,
     /// Sequence number of the last frame, as 32 bits in the file and extended.
     last: Option<(u32, u64)>,
+    /// Time of the last frame of another program's recording, nanoseconds, and the number of those out of order.
+    order: (i64, u64),
     is_over: bool,
 }
 
@@ -48,15 +93,31 @@ pub fn recorded_notes(path: &Path) -> Result<Vec<(String, Vec<u8>)>, CaptureErro
                 bytes = bytes.saturating_add(message.data.len());
                 notes.push((message.channel.topic.clone(), message.data.into_owned()));
             }
-            Err(error) if notes.is_empty() => {
-                let text = format!("{} is no recording: {error}", path.display());
-                return Err(CaptureError::general(CaptureErrorKind::Corrupt, text));
-            }
+            Err(error) if notes.is_empty() => return Err(not_readable(path, &error)),
             // Cut off: what came before counts.
             Err(_) => break,
         }
     }
     Ok(notes)
+}
+
+/// Returns the error of a file without a readable message.
+pub(super) fn not_readable(path: &Path, error: &mcap::McapError) -> CaptureError {
+    use std::io::Read as _;
+    let mut start = [0; 13];
+    let read = std::fs::File::open(path).and_then(|mut file| file.read(&mut start)).unwrap_or(0);
+    let is = |magic: &[u8]| start[..read].starts_with(magic);
+    let text = match error {
+        mcap::McapError::BadMagic if is(&[0x28, 0xb5, 0x2f, 0xfd]) => {
+            "the file is compressed as a whole; unpack it with `zstd -d`".to_owned()
+        }
+        mcap::McapError::BadMagic if is(&[0x1f, 0x8b]) => "the file is compressed; unpack it with `gunzip`".to_owned(),
+        mcap::McapError::BadMagic if is(b"#ROSBAG") || is(b"SQLite format") => {
+            "it is a bag of ROS in another format; convert it with `mcap convert`".to_owned()
+        }
+        error => shortened(&error.to_string()).into_owned(),
+    };
+    CaptureError::general(CaptureErrorKind::Corrupt, format!("{} is no recording: {text}", path.display()))
 }
 
 /// Returns time, nanoseconds, and content of every message of a topic, in the order of the file, until it is truncated;
@@ -92,44 +153,87 @@ impl RecordedSpan {
 ///
 /// # Errors
 /// `NotFound` if the file is missing.
-pub fn recorded_spans(path: &Path, cameras: &[CameraId]) -> Result<Vec<RecordedSpan>, CaptureError> {
-    let topics: Vec<String> = cameras.iter().map(|camera| format!("{TOPIC}{camera}")).collect();
+pub fn recorded_spans(path: &Path, cameras: &[RecordedCamera]) -> Result<Vec<RecordedSpan>, CaptureError> {
     let mut spans = vec![RecordedSpan::default(); cameras.len()];
     for message in Parts::open(path)?.map_while(Result::ok) {
-        for (span, _) in spans.iter_mut().zip(&topics).filter(|(_, topic)| **topic == message.channel.topic) {
-            let nanos = i64::try_from(message.log_time).unwrap_or(i64::MAX);
-            span.nanos = [if span.frames == 0 { nanos } else { span.nanos[0] }, nanos];
-            span.frames += 1;
-        }
+        let is_of = |camera: &RecordedCamera| camera.topic == message.channel.topic;
+        let Some((span, camera)) = spans.iter_mut().zip(cameras).find(|(_, camera)| is_of(camera)) else { continue };
+        let stamp_nanos = match camera.times {
+            FrameTimes::Own | FrameTimes::Logged => 0,
+            FrameTimes::Stamped => {
+                let Some(Ok(schema)) = Schema::of(&message.channel) else { continue };
+                let Ok(image) = schema.image(message.data.into_owned()) else { continue };
+                image.stamp_nanos
+            }
+        };
+        let nanos = camera.times.nanos(message.log_time, stamp_nanos);
+        span.nanos = [if span.frames == 0 { nanos } else { span.nanos[0] }, nanos];
+        span.frames += 1;
     }
     Ok(spans)
 }
 
 impl McapReplay {
-    /// Opens a file for one camera; each camera reads the file independently.
+    /// Opens a recording of flyrig for one camera; each camera reads the file independently.
     ///
     /// # Errors
     /// `NotFound` if the file is missing. A camera that is not in it ends immediately.
     pub fn open(camera: &CameraId, path: &Path) -> Result<Self, CaptureError> {
-        Ok(Self {
-            camera: camera.clone(),
-            path: path.to_owned(),
-            topic: format!("{TOPIC}{camera}"),
-            messages: Parts::open(path).map_err(|error| error.of(camera))?,
-            last: None,
-            is_over: false,
-        })
+        Self::open_camera(&RecordedCamera::new(camera.clone()), path)
+    }
+
+    /// Opens a recording for one of its cameras.
+    ///
+    /// # Errors
+    /// As [`Self::open`].
+    pub fn open_camera(camera: &RecordedCamera, path: &Path) -> Result<Self, CaptureError> {
+        let messages = Parts::open(path).map_err(|error| error.of(&camera.id))?;
+        let order = (i64::MIN, 0);
+        Ok(Self { camera: camera.clone(), path: path.to_owned(), messages, last: None, order, is_over: false })
     }
 
     fn end(&mut self) -> CaptureError {
         self.is_over = true;
-        CaptureError::new(&self.camera, CaptureErrorKind::EndOfStream, "the recording is over")
+        CaptureError::new(&self.camera.id, CaptureErrorKind::EndOfStream, "the recording is over")
+    }
+
+    /// Returns the number of a message's frame. Other programs mostly do not number their messages.
+    fn count(&mut self, number: u32) -> u64 {
+        let sequence = match (self.camera.is_foreign(), self.last) {
+            (true, last) => last.map_or(0, |(_, counted)| counted + 1),
+            (false, None) => u64::from(number),
+            (false, Some((before, counted))) => match number.wrapping_sub(before) {
+                step if step <= u32::MAX / 2 => counted.wrapping_add(u64::from(step)),
+                // Back: the camera was opened again and counts from its start.
+                _ => counted.wrapping_add(1),
+            },
+        };
+        self.last = Some((number, sequence));
+        sequence
+    }
+
+    /// Returns whether a frame is later than the one before; other programs' messages may be out of order.
+    fn is_in_order(&mut self, nanos: i64) -> bool {
+        let (before, count) = &mut self.order;
+        if nanos > *before || !self.camera.is_foreign() {
+            *before = nanos;
+            return true;
+        }
+        *count += 1;
+        if count.is_power_of_two() {
+            tracing::warn!(
+                count,
+                "camera {}: a frame is left out: it is not later than the one before",
+                self.camera.id
+            );
+        }
+        false
     }
 }
 
 impl CameraSource for McapReplay {
     fn camera(&self) -> &CameraId {
-        &self.camera
+        &self.camera.id
     }
 
     fn next_frame(&mut self, _timeout: Duration) -> Result<Frame, CaptureError> {
@@ -137,32 +241,30 @@ impl CameraSource for McapReplay {
             let message = match self.messages.next() {
                 Some(Ok(message)) => message,
                 Some(Err(error)) => {
-                    tracing::warn!("camera {}: {} breaks off: {error}", self.camera, self.path.display());
+                    tracing::warn!("camera {}: {} breaks off: {error}", self.camera.id, self.path.display());
                     return Err(self.end());
                 }
                 None => break,
             };
-            if message.channel.topic != self.topic {
+            if message.channel.topic != self.camera.topic {
                 continue;
             }
-            let sequence = self.last.map_or(u64::from(message.sequence), |(before, counted)| {
-                match message.sequence.wrapping_sub(before) {
-                    step if step <= u32::MAX / 2 => counted.wrapping_add(u64::from(step)),
-                    // Back: the camera was opened again and counts from its start.
-                    _ => counted.wrapping_add(1),
+            let sequence = self.count(message.sequence);
+            let decoded = message::decode(&self.camera.id, &message.channel, message.data.into_owned());
+            let (stamp, image) = match decoded {
+                // One topic may have images of several kinds; the first decided that they can be read.
+                Err(error) if self.camera.is_foreign() && error.kind == CaptureErrorKind::Unsupported => {
+                    return Err(CaptureError { kind: CaptureErrorKind::Corrupt, ..error });
                 }
-            });
-            self.last = Some((message.sequence, sequence));
-            let schema = message.channel.schema.as_ref().map_or("", |schema| schema.name.as_str());
-            let image = message::decode(&self.camera, schema, message.data.into_owned())?;
-            return Ok(Frame {
-                camera: self.camera.clone(),
-                sequence,
-                capture_nanos: i64::try_from(message.log_time).unwrap_or(i64::MAX),
-                exposure_nanos: message::exposure_nanos(&message.channel.metadata),
-                image,
-                mask: None,
-            });
+                decoded => decoded?,
+            };
+            let capture_nanos = self.camera.times.nanos(message.log_time, stamp.0);
+            if !self.is_in_order(capture_nanos) {
+                continue;
+            }
+            let exposure_nanos = message::exposure_nanos(&message.channel.metadata);
+            let camera = self.camera.id.clone();
+            return Ok(Frame { camera, sequence, capture_nanos, exposure_nanos, image, mask: None });
         }
         Err(self.end())
     }
@@ -170,6 +272,6 @@ impl CameraSource for McapReplay {
 
 impl std::fmt::Debug for McapReplay {
     fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
-        f.debug_struct("McapReplay").field("camera", &self.camera).field("path", &self.path).finish_non_exhaustive()
+        f.debug_struct("McapReplay").field("camera", &self.camera.id).field("path", &self.path).finish_non_exhaustive()
     }
 }

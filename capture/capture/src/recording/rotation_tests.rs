@@ -172,6 +172,8 @@ struct Files {
     durable: Vec<usize>,
     syncs: usize,
     free: Option<u64>,
+    /// Whether writes fail for want of space.
+    is_full: bool,
 }
 
 #[derive(Clone, Default)]
@@ -224,7 +226,11 @@ impl Disk for Memory {
 
 impl Write for MemoryFile {
     fn write(&mut self, bytes: &[u8]) -> io::Result<usize> {
-        self.0.lock().unwrap().files[self.1].extend_from_slice(bytes);
+        let mut files = self.0.lock().unwrap();
+        if files.is_full {
+            return Err(io::ErrorKind::StorageFull.into());
+        }
+        files.files[self.1].extend_from_slice(bytes);
         Ok(bytes.len())
     }
 
@@ -264,6 +270,25 @@ fn what_is_written_becomes_durable_while_it_runs_and_at_the_end_of_every_file() 
     });
 }
 
+/// A killed process loses what is not in the file.
+#[test]
+fn a_frame_is_in_the_file_within_half_a_second() {
+    let memory = Memory::default();
+    let recorder = Recorder::start(memory.clone(), &[note()], &RecorderConfig::default()).unwrap();
+    let mut tap = recorder.tap(Script("a".into(), 0, 1000)).unwrap();
+    let mut delay = |pause_ms: u64| {
+        std::thread::sleep(Duration::from_millis(pause_ms));
+        let (before, start) = (memory.with(|files| files.files[0].len()), Instant::now());
+        assert!(tap.next_frame(Duration::ZERO).is_ok());
+        memory.until("a frame is written", |files| files.files[0].len() > before);
+        start.elapsed()
+    };
+    // The median, since the machine may be busy.
+    let mut delays: Vec<Duration> = [10, 120, 230, 340, 450, 560, 670].map(&mut delay).into();
+    delays.sort();
+    assert!(delays[3] < Duration::from_millis(450), "{delays:?}");
+}
+
 #[test]
 fn nothing_is_recorded_without_the_reserve() {
     let folder = tempfile::tempdir().unwrap();
@@ -292,7 +317,7 @@ fn a_recording_ends_with_its_index_before_the_disk_is_full() {
         assert!(tap.next_frame(Duration::ZERO).is_ok());
         memory.with(|files| files.free = Some(999));
         let start = Instant::now();
-        while recorder.state().problem.is_none() {
+        while recorder.state().paused.is_none() {
             assert!(start.elapsed() < MINUTE, "it goes on: {:?}", recorder.state());
             assert!(tap.next_frame(Duration::ZERO).is_ok(), "the camera goes on");
             std::thread::sleep(Duration::from_millis(1));
@@ -307,4 +332,68 @@ fn a_recording_ends_with_its_index_before_the_disk_is_full() {
             assert_eq!(counts.sum::<u64>(), state.frames + u64::from(state.files), "frames, and a note in each file");
         });
     }
+}
+
+/// Passes frames until the recording's state is so, and returns their number.
+fn pass_until(recorder: &Recorder, tap: &mut impl CameraSource, is_so: impl Fn(&Recorded) -> bool) -> u64 {
+    let (start, mut passed) = (Instant::now(), 0);
+    while !is_so(&recorder.state()) {
+        assert!(start.elapsed() < MINUTE, "{:?}", recorder.state());
+        assert!(tap.next_frame(Duration::ZERO).is_ok(), "the camera goes on");
+        passed += 1;
+        std::thread::sleep(Duration::from_millis(1));
+    }
+    passed
+}
+
+#[test]
+fn a_recording_goes_on_in_a_new_file_once_the_disk_has_space_again() {
+    const GIB: u64 = 1 << 30;
+    for config in [RecorderConfig::default(), RecorderConfig { reserve_bytes: GIB, ..rotating(Some(20_000), None) }] {
+        let memory = Memory::default();
+        memory.with(|files| files.free = Some(2 * GIB));
+        let recorder = Recorder::start(memory.clone(), &[note()], &config).unwrap();
+        let mut tap = recorder.tap(Script("a".into(), 0, 1_000_000)).unwrap();
+        let mut passed = pass_until(&recorder, &mut tap, |state| state.frames > 0);
+        // A byte too little, twice in turn: each time the recording waits, and goes on.
+        for _ in 0..2 {
+            memory.with(|files| files.free = Some(GIB - 1));
+            passed += pass_until(&recorder, &mut tap, |state| state.paused.is_some());
+            let full = recorder.state();
+            assert_eq!(full.problem, None, "it waits");
+            memory.with(|files| files.files.iter().for_each(|file| drop(summary(file))));
+            passed += pass_until(&recorder, &mut tap, |state| state.dropped > full.dropped + 5);
+            assert_eq!(recorder.state().files, full.files, "nothing is written to the full disk");
+            memory.with(|files| files.free = Some(GIB));
+            passed += pass_until(&recorder, &mut tap, |state| state.frames > full.frames);
+            assert!(recorder.state().paused.is_none() && recorder.state().files > full.files);
+        }
+        drop(tap);
+        let state = recorder.finish();
+        assert_eq!(state.problem, None);
+        assert_eq!(state.frames + state.dropped, passed, "every frame is in a file or counted");
+        memory.with(|files| {
+            let counts = files.files.iter().map(|file| summary(file).stats.unwrap().message_count);
+            assert_eq!(counts.sum::<u64>(), state.frames + u64::from(state.files), "frames, and a note in each file");
+        });
+    }
+}
+
+#[test]
+fn a_write_that_does_not_fit_is_followed_by_a_new_file_too() {
+    let memory = Memory::default();
+    memory.with(|files| files.free = Some(1 << 30));
+    let recorder = Recorder::start(memory.clone(), &[note()], &RecorderConfig::default()).unwrap();
+    let mut tap = recorder.tap(Script("a".into(), 0, 1_000_000)).unwrap();
+    let mut passed = pass_until(&recorder, &mut tap, |state| state.frames > 0);
+    memory.with(|files| (files.free, files.is_full) = (Some(0), true));
+    passed += pass_until(&recorder, &mut tap, |state| state.dropped > 0);
+    memory.with(|files| (files.free, files.is_full) = (Some(1 << 30), false));
+    let before = recorder.state().frames;
+    passed += pass_until(&recorder, &mut tap, |state| state.frames > before + 10);
+    drop(tap);
+    let state = recorder.finish();
+    assert_eq!(state.frames + state.dropped, passed, "every frame is in a file or counted");
+    assert_eq!((state.files, state.problem), (2, None));
+    memory.with(|files| drop(summary(&files.files[1])));
 }

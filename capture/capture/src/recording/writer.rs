@@ -29,11 +29,14 @@ use crate::source::CameraSource;
 /// Free space that a recording leaves on its file system by default, bytes: room for its index and for other programs.
 pub const RESERVE_BYTES: u64 = 1 << 30;
 
-/// Size and duration at which a chunk ends: the most that a killed process loses.
+/// Size and duration at which a chunk ends. A killed process loses the chunk and what waits for it, together less than
+/// half a second.
 const CHUNK_BYTES: u64 = 8 << 20;
-const CHUNK_TIME: Duration = Duration::from_millis(500);
+const CHUNK_TIME: Duration = Duration::from_millis(250);
 /// Interval between syncs to the disk: the most that a power cut loses, besides a chunk.
 const SYNC_TIME: Duration = Duration::from_secs(2);
+/// Interval between looks at the free space of a full disk.
+const PROBE_TIME: Duration = Duration::from_secs(1);
 
 /// Settings of a [`Recorder`].
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -42,7 +45,8 @@ pub struct RecorderConfig {
     pub compression: Option<Compression>,
     /// Limits at which a new file begins.
     pub rotation: Rotation,
-    /// Free space that is left on the file system, bytes: without it no recording starts, and a running one stops.
+    /// Free space that is left on the file system, bytes: without it no recording starts, and a running one ends its
+    /// file and begins the next one when there is space again.
     pub reserve_bytes: u64,
 }
 
@@ -52,9 +56,9 @@ impl Default for RecorderConfig {
     }
 }
 
-/// Recorder of frames to a file, in a thread of its own. It never drops a frame silently: when the disk is full, gone
-/// or too slow, the recording stops with a message and the rig continues; frames that could not be compressed in time
-/// are counted.
+/// Recorder of frames to a file, in a thread of its own. It never drops a frame silently: when the disk is gone or too
+/// slow, the recording stops with a message and the rig continues; while the disk is full, and where compression is too
+/// slow, frames are dropped and counted.
 #[derive(Debug)]
 pub struct Recorder {
     outlet: Outlet,
@@ -71,8 +75,8 @@ impl Recorder {
         Self::create_with(path, notes, &RecorderConfig { compression, ..RecorderConfig::default() })
     }
 
-    /// Creates a file, which must not exist yet, and writes the notes into it. With a [`Rotation`] it continues in
-    /// `take-0001.mcap`, `take-0002.mcap` ... beside `take.mcap`, each complete by itself.
+    /// Creates a file, which must not exist yet, and writes the notes into it. With a [`Rotation`], and after the disk
+    /// was full, it continues in `take-0001.mcap`, `take-0002.mcap` ... beside `take.mcap`, each complete by itself.
     ///
     /// # Errors
     /// `Io` names the system's error, an existing file, or the missing space.
@@ -94,8 +98,8 @@ impl Recorder {
         if let Some(shortage) = shortage(free_bytes, config.reserve_bytes) {
             return Err(McapError::Io(io::Error::new(io::ErrorKind::StorageFull, shortage)));
         }
-        let link = config.rotation.is_on().then(|| Link { recording: new_id(), part: 0 });
-        let part = RecordingPart::create(&mut disk, 0, notes, link.clone())?;
+        let link = Link { recording: new_id(), part: 0 };
+        let part = RecordingPart::create(&mut disk, notes, link.clone())?;
         let (sender, receiver) = bounded(WAITING_FRAMES);
         let shared = Arc::new(OutletState {
             waiting_bytes: AtomicUsize::new(0),
@@ -118,13 +122,13 @@ impl Recorder {
             flushed: Instant::now(),
             is_dirty: false,
             synced: Instant::now(),
+            probed: Instant::now(),
         };
         let thread = Builder::new().name("recorder".to_owned()).spawn(move || {
             match caught(move || writing.run(part, &receiver)) {
                 Ok(Ok(())) => {}
                 Ok(Err(error)) => {
-                    let is_full = matches!(&error, McapError::Io(error) if error.kind() == io::ErrorKind::StorageFull);
-                    let advice = if is_full { "free space on the disk and record" } else { "record" };
+                    let advice = if is_full(&error) { "free space on the disk and record" } else { "record" };
                     of_thread.stop(format!("{}; {advice} into a new file", cause(error)));
                 }
                 Err(text) => of_thread.stop(format!("writing failed inside: {text}; record into a new file")),
@@ -190,6 +194,10 @@ impl Drop for Recorder {
     }
 }
 
+fn is_full(error: &McapError) -> bool {
+    matches!(error, McapError::Io(error) if error.kind() == io::ErrorKind::StorageFull)
+}
+
 /// Extracts the system's error, which the text of the mcap crate omits.
 fn cause(error: McapError) -> String {
     match error {
@@ -222,7 +230,7 @@ struct Writing<D: Disk> {
     rotation: Rotation,
     reserve_bytes: u64,
     /// Link of the current part.
-    link: Option<Link>,
+    link: Link,
     shared: Arc<OutletState>,
     /// Frames of the chunk in memory, which count once they are in the file.
     fresh: Recorded,
@@ -232,51 +240,95 @@ struct Writing<D: Disk> {
     /// Whether the file has bytes that are not durable yet.
     is_dirty: bool,
     synced: Instant,
+    /// Time of the last look at the free space.
+    probed: Instant,
 }
 
 impl<D: Disk> Writing<D> {
-    fn run(&mut self, mut part: RecordingPart<D>, items: &Receiver<Item>) -> McapResult<()> {
+    /// Writes items until the recording ends. While the disk is full there is no part, and items are dropped.
+    fn run(&mut self, part: RecordingPart<D>, items: &Receiver<Item>) -> McapResult<()> {
+        let mut part = Some(part);
         loop {
-            match items.recv_timeout(CHUNK_TIME) {
-                Ok(item) => {
-                    let is_due = |(bytes, begun): (u64, Instant)| self.rotation.is_due(bytes, begun.elapsed());
-                    if part.with(&item).is_some_and(is_due) {
-                        self.finish(part)?;
-                        part = match self.next()? {
-                            Some(next) => next,
-                            None => return Ok(()),
-                        };
-                    }
-                    part.write(&item)?;
-                    self.count(&item);
-                }
-                Err(RecvTimeoutError::Timeout) => {}
+            let until_due =
+                if self.unflushed > 0 { CHUNK_TIME.saturating_sub(self.flushed.elapsed()) } else { CHUNK_TIME };
+            let written = match items.recv_timeout(until_due) {
+                Ok(item) => self.write(&mut part, &item),
+                Err(RecvTimeoutError::Timeout) => Ok(()),
                 Err(RecvTimeoutError::Disconnected) => break,
-            }
+            };
             // A frame that could not wait has ended it, or all that waited is written.
             let is_ending = self.shared.is_ending.load(Ordering::Relaxed);
             if self.shared.lock().problem.is_some() || (is_ending && items.is_empty()) {
+                written?;
                 break;
             }
-            if self.unflushed >= CHUNK_BYTES || (self.unflushed > 0 && self.flushed.elapsed() >= CHUNK_TIME) {
-                part.flush()?;
-                self.is_dirty = true;
-                self.now_in_file();
-                if !self.has_space() {
-                    break;
-                }
-            }
-            if self.is_dirty && self.synced.elapsed() >= SYNC_TIME {
-                self.disk.sync()?;
-                (self.is_dirty, self.synced) = (false, Instant::now());
+            match written.and_then(|()| self.make_durable(&mut part)) {
+                Err(error) if is_full(&error) => self.pause_after(error, &mut part)?,
+                done => done?,
             }
         }
-        self.finish(part)
+        let paused = self.shared.lock().paused.take();
+        if let Some(shortage) = paused {
+            self.shared.stop(shortage);
+        }
+        part.map_or(Ok(()), |part| self.finish(part))
+    }
+
+    fn write(&mut self, part: &mut Option<RecordingPart<D>>, item: &Item) -> McapResult<()> {
+        self.shared.waiting_bytes.fetch_sub(item.payload.len(), Ordering::Relaxed);
+        let is_due = |(bytes, begun): (u64, Instant)| self.rotation.is_due(bytes, begun.elapsed());
+        if part.as_ref().and_then(|part| part.with(item)).is_some_and(is_due)
+            && let Some(ended) = part.take()
+        {
+            self.finish(ended)?;
+            if self.has_space() {
+                *part = Some(self.next()?);
+            }
+        }
+        if part.is_none() && self.probed.elapsed() >= PROBE_TIME && self.has_space() {
+            *part = Some(self.next()?);
+            tracing::warn!("there is space again: the recording goes on in {}", self.shared.lock().file.display());
+        }
+        let written = part.as_mut().map(|part| part.write(item));
+        match &written {
+            Some(Ok(())) => self.count(item),
+            Some(Err(_)) | None => self.shared.lock().dropped += u64::from(item.bytes_sent.is_some()),
+        }
+        written.unwrap_or(Ok(()))
+    }
+
+    /// Flushes a chunk that is due, and syncs the file to the disk; ends the file when the disk is nearly full.
+    fn make_durable(&mut self, part: &mut Option<RecordingPart<D>>) -> McapResult<()> {
+        let is_due = self.unflushed >= CHUNK_BYTES || (self.unflushed > 0 && self.flushed.elapsed() >= CHUNK_TIME);
+        if let Some(file) = part.as_mut().filter(|_| is_due) {
+            file.flush()?;
+            self.is_dirty = true;
+            self.now_in_file();
+            if !self.has_space()
+                && let Some(ended) = part.take()
+            {
+                return self.finish(ended);
+            }
+        }
+        if self.is_dirty && self.synced.elapsed() >= SYNC_TIME {
+            self.disk.sync()?;
+            (self.is_dirty, self.synced) = (false, Instant::now());
+        }
+        Ok(())
+    }
+
+    /// Pauses after a write that did not fit on the disk. The file breaks off, but everything before is readable.
+    fn pause_after(&mut self, error: McapError, part: &mut Option<RecordingPart<D>>) -> McapResult<()> {
+        drop(part.take());
+        let lost = std::mem::take(&mut self.fresh).frames;
+        self.shared.lock().dropped += lost;
+        (self.is_dirty, self.unflushed) = (false, 0);
+        // Without a measure of free space nothing says when to go on; a quota leaves space that cannot be used.
+        if self.disk.free_bytes().is_none() || self.has_space() { Err(error) } else { Ok(()) }
     }
 
     fn count(&mut self, item: &Item) {
         let length = item.payload.len();
-        self.shared.waiting_bytes.fetch_sub(length, Ordering::Relaxed);
         self.unflushed += length as u64;
         if let Some(bytes_sent) = item.bytes_sent {
             self.fresh.frames += 1;
@@ -290,15 +342,18 @@ impl<D: Disk> Writing<D> {
         (self.flushed, self.unflushed) = (Instant::now(), 0);
     }
 
-    /// Returns whether the reserve is still free; stops the recording otherwise.
-    fn has_space(&self) -> bool {
+    /// Returns whether the reserve is free; pauses the recording otherwise.
+    fn has_space(&mut self) -> bool {
+        self.probed = Instant::now();
         let free_bytes = self.disk.free_bytes();
-        self.shared.lock().free_bytes = free_bytes;
         let shortage = shortage(free_bytes, self.reserve_bytes);
         let has_space = shortage.is_none();
-        if let Some(shortage) = shortage {
-            self.shared.stop(shortage);
+        let mut state = self.shared.lock();
+        state.free_bytes = free_bytes;
+        if let Some(shortage) = shortage.as_ref().filter(|_| state.paused.is_none()) {
+            tracing::error!("the recording pauses after {} frames: {shortage}", state.frames);
         }
+        state.paused = shortage;
         has_space
     }
 
@@ -309,27 +364,20 @@ impl<D: Disk> Writing<D> {
         Ok(())
     }
 
-    /// Begins the next file; `None` when there is no space for it.
-    fn next(&mut self) -> McapResult<Option<RecordingPart<D>>> {
-        if !self.has_space() {
-            return Ok(None);
-        }
-        let number = self.link.as_ref().map_or(0, |link| link.part).saturating_add(1);
-        if let Some(link) = &mut self.link {
-            link.part = number;
-        }
-        let path = self.disk.path(number);
-        let part =
-            RecordingPart::create(&mut self.disk, number, &self.notes, self.link.clone()).map_err(
-                |error| match error {
-                    McapError::Io(error) => {
-                        let text = format!("{} cannot be created: {error}", path.display());
-                        McapError::Io(io::Error::new(error.kind(), text))
-                    }
-                    other => other,
-                },
-            )?;
+    /// Begins the next file.
+    fn next(&mut self) -> McapResult<RecordingPart<D>> {
+        let link = Link { part: self.link.part.saturating_add(1), ..self.link.clone() };
+        let path = self.disk.path(link.part);
+        let named = |error| match error {
+            McapError::Io(error) => {
+                let text = format!("{} cannot be created: {error}", path.display());
+                McapError::Io(io::Error::new(error.kind(), text))
+            }
+            other => other,
+        };
+        let part = RecordingPart::create(&mut self.disk, &self.notes, link.clone()).map_err(named)?;
+        self.link = link;
         self.shared.begin_file(path);
-        Ok(Some(part))
+        Ok(part)
     }
 }

@@ -103,6 +103,12 @@ impl Session {
         self.subjects.iter().any(|subject| subject.pose().is_some())
     }
 
+    /// Returns how the first person contradicts the rig's up direction ([`crate::Upright::fault`]); `None` where they agree.
+    #[must_use]
+    pub fn upright_fault(&self) -> Option<String> {
+        self.subjects.first().and_then(|subject| subject.upright().fault(self.rig.world_up))
+    }
+
     /// Replaces perception from the next frame set on.
     pub fn set_perception(&mut self, perception: impl Perception + 'static) {
         self.perceiver = Perceiver::new(Box::new(perception));
@@ -287,6 +293,7 @@ impl Session {
         };
         let pose = &seen.pose;
         subject.track.curve.push(set.master_nanos, pose);
+        subject.check_up(pose, self.rig.world_up);
         let per_view_time = self.settings.tracking.per_view_time;
         let poses = view_poses(set, seen, per_view_time, |nanos| subject.track.curve.at(nanos));
         let (slots, views) = input_views(set, seen, &poses, &self.rig, &mut self.counts);
