@@ -8,7 +8,7 @@ use glam::{DMat3, DMat4, DVec3};
 use crate::gltf_file::GltfFile;
 use crate::gltf_mesh::{Mesh, read_meshes};
 use crate::gltf_nodes::{Nodes, Placement};
-use crate::gltf_skins::BodySkins;
+use crate::gltf_skins::{BodySkins, is_invertible};
 use crate::part::part_of_joints;
 use crate::{BodyError, Joint, Skeleton, SkinWeights, Template};
 
@@ -41,6 +41,10 @@ pub fn load_gltf(path: &Path) -> Result<GltfHuman, BodyError> {
     let BodySkins { mut joint_nodes, mut inverse_binds, skins } = BodySkins::new(&file, &nodes)?;
     let mut mesh = read_meshes(&file, &skins)?;
     let new_from_old = order_joints(&file, &nodes, &mesh.skin, &mut joint_nodes, &mut inverse_binds)?;
+    if let Some(joint) = inverse_binds.iter().position(|matrix| !is_invertible(matrix)) {
+        let name = joint_name(&file, joint_nodes[joint]);
+        return Err(file.fail(format!("the inverse bind matrix of joint '{name}' cannot be inverted; export it again")));
+    }
     for skin in &mut mesh.skin {
         for (joint, weight) in skin.joints.iter_mut().zip(skin.weights) {
             *joint = if weight > 0.0 { new_from_old[usize::from(*joint)] } else { 0 };

@@ -135,10 +135,8 @@ fn accessor(accessor: &mut Map<String, Value>) {
         accessor.insert("sparse".to_owned(), json!({ "count": 0, "indices": view, "values": view }));
     }
     // The parser requires bounds of positions, which quantised and hand-made files give in other forms.
-    if accessor.get("type") == Some(&json!("VEC3")) {
-        for bound in ["min", "max"] {
-            accessor.insert(bound.to_owned(), json!([0, 0, 0]));
-        }
+    for bound in ["min", "max"] {
+        accessor.insert(bound.to_owned(), json!([0, 0, 0]));
     }
 }
 
