@@ -5,8 +5,8 @@ use std::collections::BTreeMap;
 use glam::DMat4;
 
 use crate::BodyError;
+use crate::error::shown;
 use crate::gltf_file::GltfFile;
-use crate::gltf_json::shown;
 use crate::gltf_limits::{MAX_JOINTS, MAX_SKINS};
 use crate::gltf_nodes::Nodes;
 
