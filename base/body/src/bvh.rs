@@ -6,6 +6,7 @@ use std::path::{Path, PathBuf};
 use glam::{DQuat, DVec3};
 
 use crate::BodyError;
+use crate::error::shown;
 
 /// Longest clip, frames; a longer one has a damaged header.
 const MAX_FRAMES: usize = 10_000_000;
@@ -121,7 +122,7 @@ pub fn parse_bvh(text: &str, path: &Path) -> Result<BvhClip, BodyError> {
             "JOINT" => {
                 let child = joint(&mut words, Some(current))?;
                 if joints.iter().any(|known| known.name == child.name) {
-                    return Err(words.fail(format!("a second joint is called '{}'", child.name)));
+                    return Err(words.fail(format!("a second joint is called '{}'", shown(&child.name))));
                 }
                 open.push(joints.len());
                 joints.push(child);
@@ -137,7 +138,10 @@ pub fn parse_bvh(text: &str, path: &Path) -> Result<BvhClip, BodyError> {
             "}" => {
                 open.pop();
             }
-            other => return Err(words.fail(format!("'{other}' where a joint, an end site or '}}' should stand"))),
+            other => {
+                let other = shown(other);
+                return Err(words.fail(format!("'{other}' where a joint, an end site or '}}' should stand")));
+            }
         }
     }
     words.expect("MOTION")?;
@@ -192,7 +196,7 @@ fn channels(words: &mut Words<'_>) -> Result<Vec<BvhChannel>, BodyError> {
         channels.push(match (axis, word.get(1..)) {
             (Some(axis), Some("position")) => BvhChannel::Position(axis),
             (Some(axis), Some("rotation")) => BvhChannel::Rotation(axis),
-            _ => return Err(words.fail(format!("channel '{word}'; known are Xposition .. Zrotation"))),
+            _ => return Err(words.fail(format!("channel '{}'; known are Xposition .. Zrotation", shown(&word)))),
         });
     }
     Ok(channels)
@@ -249,7 +253,7 @@ impl<'a> Words<'a> {
                 self.rest = rest.trim_start().trim_start_matches(':');
                 Ok(())
             }
-            _ => Err(self.fail(format!("'{}' where '{wanted}:' should stand", self.rest.trim_end()))),
+            _ => Err(self.fail(format!("'{}' where '{wanted}:' should stand", shown(self.rest.trim_end())))),
         }
     }
 
@@ -263,7 +267,7 @@ impl<'a> Words<'a> {
         let found = self.next(&format!("'{wanted}'"))?;
         match found.eq_ignore_ascii_case(wanted) {
             true => Ok(()),
-            false => Err(self.fail(format!("'{found}' where '{wanted}' should stand"))),
+            false => Err(self.fail(format!("'{}' where '{wanted}' should stand", shown(found)))),
         }
     }
 
@@ -271,7 +275,7 @@ impl<'a> Words<'a> {
         let word = self.next("a number")?;
         match word.parse::<f64>() {
             Ok(number) if number.is_finite() => Ok(number),
-            _ => Err(self.fail(format!("'{word}' where a finite number should stand"))),
+            _ => Err(self.fail(format!("'{}' where a finite number should stand", shown(word)))),
         }
     }
 

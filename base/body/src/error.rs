@@ -97,3 +97,11 @@ pub enum BodyError {
         source: PoseError,
     },
 }
+
+/// Characters of a file's text that a message repeats.
+const SHOWN: usize = 100;
+
+/// Shortens and escapes text of a file for a message.
+pub(crate) fn shown(text: &str) -> String {
+    text.chars().take(SHOWN).collect::<String>().escape_debug().to_string()
+}

@@ -5,10 +5,11 @@ use std::path::Path;
 use flyrig_types::{Pose, PoseTrack};
 use glam::{DMat3, DMat4, DVec3};
 
+use crate::error::shown;
 use crate::gltf_file::GltfFile;
 use crate::gltf_mesh::{Mesh, read_meshes};
 use crate::gltf_nodes::{Nodes, Placement};
-use crate::gltf_skins::BodySkins;
+use crate::gltf_skins::{BodySkins, is_invertible};
 use crate::part::part_of_joints;
 use crate::{BodyError, Joint, Skeleton, SkinWeights, Template};
 
@@ -41,6 +42,10 @@ pub fn load_gltf(path: &Path) -> Result<GltfHuman, BodyError> {
     let BodySkins { mut joint_nodes, mut inverse_binds, skins } = BodySkins::new(&file, &nodes)?;
     let mut mesh = read_meshes(&file, &skins)?;
     let new_from_old = order_joints(&file, &nodes, &mesh.skin, &mut joint_nodes, &mut inverse_binds)?;
+    if let Some(joint) = inverse_binds.iter().position(|matrix| !is_invertible(matrix)) {
+        let name = shown(&joint_name(&file, joint_nodes[joint]));
+        return Err(file.fail(format!("the inverse bind matrix of joint '{name}' cannot be inverted; export it again")));
+    }
     for skin in &mut mesh.skin {
         for (joint, weight) in skin.joints.iter_mut().zip(skin.weights) {
             *joint = if weight > 0.0 { new_from_old[usize::from(*joint)] } else { 0 };
@@ -136,7 +141,7 @@ fn order_joints(
             [_] => break,
             [] => return Err(file.fail("the skin has no joints")),
             [a, b, ..] => {
-                let (a, b) = (joint_name(file, ordered[*a]), joint_name(file, ordered[*b]));
+                let (a, b) = (shown(&joint_name(file, ordered[*a])), shown(&joint_name(file, ordered[*b])));
                 return Err(file.fail(format!("joints '{a}' and '{b}' have no common parent joint; add a root bone")));
             }
         }
@@ -167,7 +172,7 @@ pub(crate) fn joint_parents(nodes: &Nodes, joint_nodes: &[usize]) -> Vec<Option<
 fn placements(file: &GltfFile<'_>, world: &[DMat4], joint_nodes: &[usize]) -> Result<Vec<Placement>, BodyError> {
     let placement = |&node: &usize| {
         Placement::from_matrix(&world[node]).ok_or_else(|| {
-            let name = joint_name(file, node);
+            let name = shown(&joint_name(file, node));
             file.fail(format!(
                 "joint '{name}' is sheared, mirrored or scaled unevenly; apply its scale and export again"
             ))

@@ -5,6 +5,8 @@ use std::path::Path;
 use gltf::json::Root;
 use serde_json::{Map, Value, json};
 
+use crate::error::shown;
+
 /// Compressions of data; nothing can be read without unpacking them.
 const COMPRESSED: [&str; 3] = ["KHR_draco_mesh_compression", "EXT_meshopt_compression", "KHR_meshopt_compression"];
 
@@ -33,9 +35,6 @@ const IGNORED: [&str; 22] = [
     "VRM",
     "FB_ngon_encoding",
 ];
-
-/// Names of other extensions that an error lists.
-const SHOWN: usize = 100;
 
 /// Parses the JSON part and keeps the fields that the import reads.
 ///
@@ -101,11 +100,6 @@ fn compressed(extension: &str, path: &Path) -> String {
     )
 }
 
-/// Shortens and escapes text of the file.
-pub(crate) fn shown(text: &str) -> String {
-    text.chars().take(SHOWN).collect::<String>().escape_debug().to_string()
-}
-
 /// Takes the array of this name and changes its items; something else than an array is left to the parser.
 fn items(whole: &mut Value, name: &str, change: impl Fn(&mut Map<String, Value>)) -> Value {
     let mut list = match whole.get_mut(name) {
@@ -135,10 +129,8 @@ fn accessor(accessor: &mut Map<String, Value>) {
         accessor.insert("sparse".to_owned(), json!({ "count": 0, "indices": view, "values": view }));
     }
     // The parser requires bounds of positions, which quantised and hand-made files give in other forms.
-    if accessor.get("type") == Some(&json!("VEC3")) {
-        for bound in ["min", "max"] {
-            accessor.insert(bound.to_owned(), json!([0, 0, 0]));
-        }
+    for bound in ["min", "max"] {
+        accessor.insert(bound.to_owned(), json!([0, 0, 0]));
     }
 }
 

@@ -4,8 +4,8 @@ use glam::{DMat3, DMat4, DQuat, DVec3};
 use gltf::animation::{Interpolation, Property};
 
 use crate::BodyError;
+use crate::error::shown;
 use crate::gltf_file::GltfFile;
-use crate::gltf_json::shown;
 use crate::gltf_limits::{MAX_ANIMATION_KEYS, MAX_KEY_SECS, MAX_NODES, MAX_POSED_NODES};
 
 /// Interval of poses between two keys of a cubic curve, nanoseconds.

@@ -5,8 +5,8 @@ use std::collections::BTreeMap;
 use glam::DMat4;
 
 use crate::BodyError;
+use crate::error::shown;
 use crate::gltf_file::GltfFile;
-use crate::gltf_json::shown;
 use crate::gltf_limits::{MAX_JOINTS, MAX_SKINS};
 use crate::gltf_nodes::Nodes;
 
@@ -41,7 +41,7 @@ impl BodySkins {
     /// a joint or hang on each other's joints are one body.
     ///
     /// # Errors
-    /// [`BodyError::Gltf`] without a skin, over a limit, or with inverse bind matrices that are missing or cannot be inverted.
+    /// [`BodyError::Gltf`] without a skin, over a limit, or with too few inverse bind matrices.
     pub fn new(file: &GltfFile<'_>, nodes: &Nodes) -> Result<Self, BodyError> {
         let count = |mesh: gltf::Mesh<'_>| {
             let positions = mesh.primitives().filter_map(|primitive| primitive.get(&gltf::Semantic::Positions));
@@ -106,17 +106,23 @@ impl BodySkins {
     fn join(&mut self, skin: &FileSkin, world: &[DMat4]) {
         let mut known: BTreeMap<usize, usize> = self.joint_nodes.iter().copied().zip(0..).collect();
         let places: Vec<Option<usize>> = skin.joint_nodes.iter().map(|node| known.get(node).copied()).collect();
-        let from_mesh = |joint: usize, own: usize| self.inverse_binds[joint].inverse() * skin.inverse_binds[own];
+        // Joints without effect may have matrices of zeros.
+        let from_mesh = |joint: usize, own: usize| {
+            let matrix = self.inverse_binds[joint].inverse() * skin.inverse_binds[own];
+            (matrix.is_finite() && is_invertible(&matrix)).then_some(matrix)
+        };
         // By a shared joint, or else as the nodes rest.
-        let shared = places.iter().enumerate().find_map(|(own, &joint)| Some(from_mesh(joint?, own)));
-        let common = shared.unwrap_or_else(|| match (self.joint_nodes.first(), skin.joint_nodes.first()) {
-            (Some(&root), Some(&node)) => {
-                let world_from_body = world[root] * self.inverse_binds[0];
-                world_from_body.inverse() * world[node] * skin.inverse_binds[0]
-            }
-            _ => DMat4::IDENTITY,
-        });
-        let own_matrix = |(own, joint): (usize, &Option<usize>)| joint.map_or(common, |joint| from_mesh(joint, own));
+        let shared = places.iter().enumerate().find_map(|(own, &joint)| from_mesh(joint?, own));
+        let world_from_mesh = |nodes: &[usize], binds: &[DMat4]| {
+            nodes.iter().zip(binds).map(|(&node, bind)| world[node] * *bind).find(is_invertible)
+        };
+        let at_rest = || {
+            let body = world_from_mesh(&self.joint_nodes, &self.inverse_binds)?;
+            Some(body.inverse() * world_from_mesh(&skin.joint_nodes, &skin.inverse_binds)?)
+        };
+        let common = shared.or_else(at_rest).unwrap_or(DMat4::IDENTITY);
+        let own_matrix =
+            |(own, joint): (usize, &Option<usize>)| joint.and_then(|joint| from_mesh(joint, own)).unwrap_or(common);
         let body_from_mesh: Vec<DMat4> = places.iter().enumerate().map(own_matrix).collect();
         let is_same = body_from_mesh.iter().all(|matrix| matrix.abs_diff_eq(DMat4::IDENTITY, 1e-9));
         let mut joints = Vec::with_capacity(places.len());
@@ -145,12 +151,13 @@ impl FileSkin {
             }
             inverse_binds = matrices[..joint_nodes.len()].iter().map(DMat4::from_cols_array).collect();
         }
-        if let Some(joint) = inverse_binds.iter().position(|matrix| !matrix.inverse().is_finite()) {
-            let name = skin_name(file, skin.index());
-            return Err(file.fail(format!("inverse bind matrix {joint} of skin {name} cannot be inverted")));
-        }
         Ok(Self { index: skin.index(), joint_nodes, inverse_binds, vertices })
     }
+}
+
+/// Returns whether a matrix has a finite inverse.
+pub(crate) fn is_invertible(matrix: &DMat4) -> bool {
+    matrix.inverse().is_finite()
 }
 
 fn skin_name(file: &GltfFile<'_>, index: usize) -> String {

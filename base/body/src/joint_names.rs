@@ -1,5 +1,6 @@
 //! Correspondence of the joints of another skeleton with those of ours, by the names of the usual rigs.
 
+use crate::error::shown;
 use crate::{BodyError, Skeleton};
 
 /// Names of the joints of one side, lower case without separators and without the side's word, which stands before or behind: those of
@@ -117,7 +118,7 @@ pub(crate) fn match_joints(
             "{what} has no joint '{}' (nor one with that joint's name in Mixamo, SMPL, VRM, Poser or Unreal rigs; its joints \
              are called {}); rename them",
             theirs.join("', '"),
-            shown(&foreign.iter().map(|joint| joint.name).collect::<Vec<_>>(), 6)
+            listed(&foreign.iter().map(|joint| joint.name).collect::<Vec<_>>(), 6)
         )));
     }
     match unmatched(skeleton, foreign, &source) {
@@ -156,7 +157,7 @@ fn unmatched(skeleton: &Skeleton, foreign: &[Named<'_>], source: &[Option<usize>
     };
     let rest = (0..foreign.len()).filter(|&joint| !is_known[joint] && !is_below_end(joint));
     let theirs: Vec<&str> = rest.map(|joint| foreign[joint].name).collect();
-    let unknown = |names: &[&str]| format!("joints with unknown names: {}", shown(names, SHOWN));
+    let unknown = |names: &[&str]| format!("joints with unknown names: {}", listed(names, SHOWN));
     match (ours.is_empty(), theirs.is_empty()) {
         (true, true) => None,
         (true, false) => Some((false, unknown(&theirs))),
@@ -169,10 +170,9 @@ fn unmatched(skeleton: &Skeleton, foreign: &[Named<'_>], source: &[Option<usize>
 }
 
 /// Joins names, at most `limit` of them.
-fn shown(names: &[&str], limit: usize) -> String {
+fn listed(names: &[&str], limit: usize) -> String {
     let more = if names.len() > limit { format!(" and {} more", names.len() - limit) } else { String::new() };
-    let cut = |name: &&str| name.chars().take(100).collect::<String>().escape_debug().to_string();
-    format!("{}{more}", names.iter().take(limit).map(cut).collect::<Vec<_>>().join(", "))
+    format!("{}{more}", names.iter().take(limit).map(|name| shown(name)).collect::<Vec<_>>().join(", "))
 }
 
 /// Returns the lowest joint above or at both.
