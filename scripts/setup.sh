@@ -13,7 +13,9 @@ wanted=(
   "pkg-config:finds installed libraries for the build"
   "clang:the opencv and v4l crates read the headers of OpenCV and of the kernel with it"
   "libclang-dev:the same"
-  "libopencv-dev:camera files, video files and image processing"
+  "libopencv-dev:image files and image processing"
+  "libavformat-dev:video files"
+  "libswscale-dev:the same"
   "libvulkan1:the Vulkan loader, to reach the graphics adapter"
 )
 # The software adapter is only needed where no other Vulkan driver is installed.

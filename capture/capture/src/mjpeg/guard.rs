@@ -1,6 +1,7 @@
 //! Decision whether a camera's JPEG image is damaged, with what its images before were like.
 
-use super::scan::{Fault, Scan, walk};
+use super::fault::Fault;
+use super::scan::{Scan, Tables, walk};
 use super::shifts::ImageLevels;
 
 /// Fault of an image that a decoder does not notice.
@@ -36,8 +37,8 @@ pub(crate) struct Guard {
     used: Option<ImageLevels>,
     shifted: Option<ImageLevels>,
     /// Tables of the last image that was used, and of the last that was refused for them.
-    tables: Option<Vec<u8>>,
-    refused_tables: Option<Vec<u8>>,
+    tables: Option<Tables>,
+    refused_tables: Option<Tables>,
     /// Recent images with an oddity, weighted.
     odd: u32,
 }
@@ -77,43 +78,62 @@ impl Guard {
     }
 
     fn check_tables(&mut self, scan: &Scan) -> Result<(), Damage> {
-        if self.tables.as_ref() != Some(&scan.tables) && self.refused_tables.as_ref() != Some(&scan.tables) {
-            let is_near = |before: &Vec<u8>| {
-                let others = before.iter().zip(&scan.tables).filter(|(a, b)| a != b).count();
-                before.len() == scan.tables.len() && others <= FEW
-            };
+        let tables = &scan.tables;
+        if self.tables.as_ref() != Some(tables) {
             let is_doubtful = match &self.tables {
-                Some(before) if is_near(before) => true,
-                _ => scan.quantisation.iter().any(is_almost_standard),
+                Some(before) => !is_other_quality(before, tables) || (is_standard(before) && !is_standard(tables)),
+                None => tables.quantisation.iter().any(is_almost_standard),
             };
-            if is_doubtful {
-                self.refused_tables = Some(scan.tables.clone());
+            if is_doubtful && self.refused_tables.as_ref() != Some(tables) {
+                self.refused_tables = Some(tables.clone());
                 return Err(Damage::Tables);
             }
-        }
-        if self.tables.as_ref() != Some(&scan.tables) {
-            self.tables = Some(scan.tables.clone());
+            self.tables = Some(tables.clone());
         }
         self.refused_tables = None;
         Ok(())
     }
 }
 
-/// Entries that damage changes; a camera that changes its quality changes most of them.
+/// Entries that damage changes at most; an encoder that changes its quality changes more, or these by little.
 const FEW: usize = 12;
 
-/// Returns whether a table in zigzag order is like a standard one of some quality, but for a few entries.
-fn is_almost_standard(table: &[u16; 64]) -> bool {
-    STANDARD.iter().any(|standard| {
-        let others = (1..=100).map(|quality: u32| {
-            // The scale of the Independent JPEG Group, which most encoders use.
-            let scale = if quality < 50 { 5000 / quality } else { 200 - 2 * quality };
-            let entry = |base: u8| ((u32::from(base) * scale + 50) / 100).clamp(1, 255) as u16;
-            standard.iter().zip(table).filter(|(base, value)| entry(**base) != **value).count()
-        });
-        // A table of the lowest qualities is like its neighbours.
-        others.min().is_some_and(|others| (1..=FEW).contains(&others))
+/// Returns whether tables are those of another quality: all entries that differ are larger, or all are smaller.
+fn is_other_quality(before: &Tables, now: &Tables) -> bool {
+    if before.selectors != now.selectors || before.quantisation.len() != now.quantisation.len() {
+        return false;
+    }
+    let pairs = before.quantisation.iter().flatten().zip(now.quantisation.iter().flatten());
+    let changed: Vec<(u16, u16)> = pairs.map(|(a, b)| (*a, *b)).filter(|(a, b)| a != b).collect();
+    let is_one_way = changed.iter().all(|(a, b)| a < b) || changed.iter().all(|(a, b)| a > b);
+    let is_little = || changed.iter().all(|(a, b)| a.abs_diff(*b) <= (a / 5).max(1));
+    changed.len() >= 2 && is_one_way && (changed.len() > FEW || is_little())
+}
+
+/// Returns the entry of a standard table at a quality from 1 to 100, by the scale of the Independent JPEG Group, which
+/// most encoders use.
+fn scaled(base: u8, quality: u32) -> u16 {
+    let scale = if quality < 50 { 5000 / quality } else { 200 - 2 * quality };
+    ((u32::from(base) * scale + 50) / 100).clamp(1, 255) as u16
+}
+
+/// Returns whether every table is a standard one of some quality.
+fn is_standard(tables: &Tables) -> bool {
+    tables.quantisation.iter().all(|table| {
+        let is_of = |standard: &[u8; 64], quality| standard.iter().zip(table).all(|(b, v)| scaled(*b, quality) == *v);
+        STANDARD.iter().any(|standard| (1..=100).any(|quality| is_of(standard, quality)))
     })
+}
+
+/// Returns whether a table is a standard one of some quality, but for up to three entries.
+fn is_almost_standard(table: &[u16; 64]) -> bool {
+    let others = |standard: &[u8; 64], quality| {
+        let entries = standard.iter().zip(table).map(|(base, value)| scaled(*base, quality).abs_diff(*value));
+        entries.filter(|difference| *difference > 0).fold((0, 0), |(count, most), d| (count + 1, d.max(most)))
+    };
+    let best = STANDARD.iter().flat_map(|standard| (1..=100).map(|quality| others(standard, quality))).min();
+    // Encoders that round in another way differ by one.
+    best.is_some_and(|(count, most)| (1..=3).contains(&count) && most > 1)
 }
 
 /// ITU-T T.81, tables K.1 and K.2, in zigzag order.
@@ -153,6 +173,26 @@ mod tests {
             let is_odd = i % 10 == 9;
             let bytes = if is_odd { odd(i) } else { encoded(96, 64, 0, i) };
             assert_eq!(check(&mut guard, &bytes).is_err(), is_odd, "{i}");
+        }
+    }
+
+    #[test]
+    fn another_quality_is_no_damage() {
+        for base in [STANDARD[0], [40; 64]] {
+            let of = |percent: u32| Tables {
+                quantisation: vec![base.map(|b| ((u32::from(b) * percent + 50) / 100).clamp(1, 255) as u16); 2],
+                selectors: vec![[1, 0], [2, 1]],
+            };
+            for (before, now) in [(100, 50), (20, 100), (100, 101), (30, 40)] {
+                assert!(of(before) == of(now) || is_other_quality(&of(before), &of(now)), "{before} {now}");
+            }
+            let mut damaged = of(100);
+            damaged.quantisation[1][5] += 30;
+            assert!(!is_other_quality(&of(100), &damaged));
+            for i in 0..40 {
+                damaged.quantisation[0][i] = (i * 37 % 255 + 1) as u16;
+            }
+            assert!(!is_other_quality(&of(100), &damaged));
         }
     }
 

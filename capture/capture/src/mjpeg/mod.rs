@@ -1,5 +1,6 @@
 //! JPEG images from cameras: often without Huffman tables, sometimes padded, sometimes damaged.
 
+mod fault;
 mod guard;
 mod scan;
 mod shifts;

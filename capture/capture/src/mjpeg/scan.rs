@@ -3,50 +3,12 @@
 //! Damage almost always shifts the reader against the bits, so that it meets a code that does not exist, a 65th
 //! coefficient, or the end of the data too early or too late. Decoders are lenient with these; here they are faults.
 
-use std::fmt;
+use super::fault::Fault;
 
 /// Largest number of colour components of a frame.
 const COMPONENTS: usize = 4;
 /// Bits that one look-up decodes; longer codes are rare.
 const FAST_BITS: u32 = 10;
-
-/// Fault of an image.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub(crate) enum Fault {
-    /// Marker segment with impossible content.
-    Header,
-    /// Bits that are no Huffman code.
-    Code,
-    /// More coefficients than a block has, or one that 8-bit images cannot have.
-    Coefficient,
-    /// Mean of a block outside of black to white.
-    Mean,
-    /// Data that end before the last block.
-    Early,
-    /// Bytes behind the last block.
-    Surplus,
-    /// Padding bits that are not 1.
-    Padding,
-    /// Restart marker that is missing or out of order, or another marker within the data.
-    Marker,
-}
-
-impl fmt::Display for Fault {
-    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        f.write_str(match self {
-            Self::Header => "a header segment is impossible",
-            Self::Code => "its data hold a code that does not exist",
-            Self::Coefficient => "its data hold an impossible coefficient",
-            Self::Mean => "a block is blacker than black or whiter than white",
-            Self::Early => "its data end too early",
-            Self::Surplus => "data are left behind its last block",
-            Self::Padding => "its data do not end with padding",
-            Self::Marker => "a marker is missing or out of order",
-        })
-    }
-}
-
-impl std::error::Error for Fault {}
 
 /// Means of one block and of its outer rows, grey levels around 0.
 #[derive(Debug, Clone, Copy, Default, PartialEq)]
@@ -77,10 +39,16 @@ pub(crate) struct Scan {
     pub restart_interval: usize,
     /// Faults that some cameras commit in every image: padding bits and surplus bytes.
     pub oddity: Option<Fault>,
+    pub tables: Tables,
+}
+
+/// Tables of an image, and which component uses which.
+#[derive(Debug, Clone, Default, PartialEq, Eq)]
+pub(crate) struct Tables {
     /// Quantisation tables in zigzag order.
     pub quantisation: Vec<[u16; 64]>,
-    /// Their bytes and those of the components.
-    pub tables: Vec<u8>,
+    /// Identifier and quantisation table of each component.
+    pub selectors: Vec<[u8; 2]>,
 }
 
 /// Component of a frame header.
@@ -253,7 +221,6 @@ struct Header {
     ac: [Option<Huffman>; 4],
     restart_interval: usize,
     start: usize,
-    tables: Vec<u8>,
 }
 
 fn header(bytes: &[u8], segments: impl Iterator<Item = (usize, u8)>) -> Result<Option<Header>, Fault> {
@@ -265,7 +232,6 @@ fn header(bytes: &[u8], segments: impl Iterator<Item = (usize, u8)>) -> Result<O
         ac: [const { None }; 4],
         restart_interval: 0,
         start: 0,
-        tables: Vec::new(),
     };
     for (at, marker) in segments {
         let length = bytes.get(at + 2..at + 4).map_or(0, |l| usize::from(u16::from_be_bytes([l[0], l[1]])));
@@ -292,7 +258,6 @@ fn header(bytes: &[u8], segments: impl Iterator<Item = (usize, u8)>) -> Result<O
 
 impl Header {
     fn quantisation_tables(&mut self, mut body: &[u8]) -> Result<(), Fault> {
-        self.tables.extend_from_slice(body);
         while let Some((&kind, rest)) = body.split_first() {
             let (bytes, place) = (if kind >> 4 == 0 { 1 } else { 2 }, usize::from(kind & 15));
             let table = rest.get(..64 * bytes).filter(|_| kind >> 4 <= 1 && place < 4).ok_or(Fault::Header)?;
@@ -332,7 +297,6 @@ impl Header {
         if self.size.contains(&0) || !(1..=COMPONENTS).contains(&count) || rest.len() != 3 * count {
             return Err(Fault::Header);
         }
-        self.tables.extend_from_slice(rest);
         self.components.clear();
         for part in rest.chunks_exact(3) {
             let sampling = [usize::from(part[1] >> 4), usize::from(part[1] & 15)];
@@ -495,8 +459,10 @@ pub(crate) fn walk(bytes: &[u8], segments: impl Iterator<Item = (usize, u8)>) ->
         return Err(Fault::Marker);
     }
     scan.oddity = scan.oddity.or(odd);
-    scan.quantisation = header.quantisation.into_iter().flatten().collect();
-    scan.tables = header.tables;
+    scan.tables = Tables {
+        quantisation: header.quantisation.into_iter().flatten().collect(),
+        selectors: header.components.iter().map(|c| [c.id, c.quantisation as u8]).collect(),
+    };
     Ok(Some(scan))
 }
 

@@ -168,9 +168,7 @@ fn is_changed_from_a_place_on(now: &Levels, before: &Levels) -> bool {
     // Anywhere in a row, or by precisely one value and with a sharp edge at its ends as well: a light that was switched on
     // between two rows changes each thing by a value of its own.
     let wide = [2.0f32, 4.0, 8.0, 16.0, 32.0, 64.0].into_iter().map(|least| (least, 2.5 * least, false));
-    let narrow =
-        std::iter::successors(Some(3.0f32), |value| Some(1.1 * value + 0.5)).take_while(|value| *value < 200.0);
-    let narrow = narrow.map(|value| (0.9 * value - 0.7, 1.1 * value + 0.7, true));
+    let narrow = (3u8..=200).map(f32::from).map(|value| (value - 1.5, value + 1.5, true));
     wide.chain(narrow).any(|(least, most, is_narrow)| {
         [1.0, -1.0].iter().any(|sign| {
             // Without most of a row behind the place and of a quarter before it, there is none.
