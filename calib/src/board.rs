@@ -70,7 +70,7 @@ impl Board {
     /// [`CalibError::Board`] names the file, the key and the fix.
     pub fn load(path: &Path) -> Result<Self, CalibError> {
         let refused = |reason: String| CalibError::Board { path: path.to_owned(), reason };
-        let text = std::fs::read_to_string(path)
+        let text = flyrig_types::read_text(path)
             .map_err(|error| refused(format!("cannot be read: {error}; print one with flyrig calibrate board")))?;
         let board: Self = toml::from_str(&text).map_err(|error| refused(error.to_string()))?;
         board.check().map_err(refused)?;

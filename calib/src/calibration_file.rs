@@ -5,7 +5,7 @@
 
 use std::{fmt::Write as _, io::Write as _, path::Path};
 
-use flyrig_types::{Camera, CameraId, ColorMatch, Intrinsics, Isometry, Lens, Rig, write_whole};
+use flyrig_types::{Camera, CameraId, ColorMatch, Intrinsics, Isometry, Lens, Rig, read_text, write_whole};
 use glam::{DMat3, DVec2, DVec3};
 use serde::Deserialize;
 
@@ -18,8 +18,6 @@ use crate::error::CalibError;
 /// Name of the file in a calibration folder.
 pub(crate) const FILE: &str = "calibration.toml";
 const VERSION: u32 = 1;
-/// Maximum file size: calibrations are small, larger files are something else.
-const MAX_BYTES: u64 = 16 << 20;
 
 /// Standard deviations of a camera's pose and time offset.
 #[derive(Debug, Clone, Copy, PartialEq)]
@@ -79,15 +77,19 @@ struct DeviationEntry {
     _time_offset_ms: Option<f64>,
 }
 
-/// Reads a file as text.
+/// Reads a file as text; see [`read_text`].
 pub(crate) fn read(path: &Path) -> Result<String, CalibError> {
-    let refused = |source| CalibError::Read { path: path.to_owned(), source };
-    let bytes = std::fs::metadata(path).map_err(refused)?.len();
-    if bytes > MAX_BYTES {
-        let problem = format!("has {bytes} bytes, at most {MAX_BYTES}; it is no calibration");
-        return Err(CalibError::Format { path: path.to_owned(), problem });
+    read_text(path).map_err(|source| read_error(path, source))
+}
+
+/// Maps the error of a file that cannot be read.
+pub(crate) fn read_error(path: &Path, source: std::io::Error) -> CalibError {
+    match source.kind() {
+        std::io::ErrorKind::InvalidData => {
+            CalibError::Format { path: path.to_owned(), problem: format!("cannot be read: {source}") }
+        }
+        _ => CalibError::Read { path: path.to_owned(), source },
     }
-    std::fs::read_to_string(path).map_err(refused)
 }
 
 /// Reads the text of a `calibration.toml`; `path` is for errors.
@@ -114,7 +116,7 @@ pub(crate) fn parse(path: &Path, text: &str) -> Result<Imported, CalibError> {
     let up = file.up.map(|up| {
         direction(up).ok_or_else(|| refused("up is not a direction; give [0, 0, 1], for example".to_owned()))
     });
-    Ok(Imported { cameras, up: up.transpose()? })
+    Ok(Imported::new(cameras, up.transpose()?))
 }
 
 fn camera(path: &Path, entry: Entry) -> Result<ImportedCamera, CalibError> {

@@ -5,6 +5,9 @@
 
 mod anipose;
 mod colmap;
+mod colmap_binary;
+mod colmap_models;
+mod image_names;
 pub(crate) mod imported;
 mod kalibr;
 mod mrcal;
@@ -14,7 +17,10 @@ mod python;
 mod qualisys;
 pub(crate) mod shared;
 
-use std::{io::Write as _, path::Path};
+use std::{
+    io::Write as _,
+    path::{Path, PathBuf},
+};
 
 use flyrig_types::{CameraId, Rig, write_whole};
 
@@ -31,11 +37,11 @@ pub enum Format {
     Flyrig,
     /// `intri.yml` and `extri.yml`; also ZJU-MoCap's.
     EasyMocap,
-    /// One file `CAM.yml` of FileStorage per camera, with the keys of OpenCV's calibration sample, and `rvec`, `tvec`.
+    /// One file of FileStorage per camera, with the keys of OpenCV's calibration sample, and `rvec`, `tvec`.
     OpenCv,
     /// `camchain.yaml`.
     Kalibr,
-    /// `cameras.txt` and `images.txt`.
+    /// `cameras.txt` and `images.txt`, or `cameras.bin` and `images.bin`.
     Colmap,
     /// `transforms.json`.
     Nerfstudio,
@@ -107,40 +113,55 @@ impl Format {
     #[must_use]
     pub fn detect(path: &Path) -> Option<Self> {
         let has = |name: &str| path.join(name).is_file();
+        let text = |path: &Path| calibration_file::read(path).unwrap_or_default();
+        let storage = |text: &str| {
+            let is_chain = kalibr::is_chain(text);
+            is_chain.then_some(Self::Kalibr).or_else(|| opencv::is_storage(text).then_some(Self::OpenCv))
+        };
         if path.is_dir() {
             let of_folder = [
                 (calibration_file::FILE, Self::Flyrig),
                 ("intri.yml", Self::EasyMocap),
                 (kalibr::FILE, Self::Kalibr),
                 (colmap::CAMERAS, Self::Colmap),
+                (colmap_binary::CAMERAS, Self::Colmap),
                 (nerfstudio::FILE, Self::Nerfstudio),
                 (anipose::FILE, Self::Anipose),
                 ("camera_array.toml", Self::Anipose),
                 ("config.toml", Self::Anipose),
             ];
             let named = of_folder.into_iter().find(|(name, _)| has(name)).map(|(_, format)| format);
+            let model = || colmap::model_folder(path).map(|_| Self::Colmap);
+            let first = |ending: &str| files_with(path, ending).ok().and_then(|files| files.into_iter().next());
             let by_ending = || {
-                let with = |ending: &str| files_with(path, ending).ok().filter(|files| !files.is_empty());
-                let found = |(ending, format): (&str, Self)| with(ending).map(|_| format);
-                [(".cameramodel", Self::Mrcal), (".qca.txt", Self::Qualisys), (".yml", Self::OpenCv)]
-                    .into_iter()
-                    .find_map(found)
+                let found = |(ending, format): (&str, Self)| first(ending).map(|_| format);
+                [(".cameramodel", Self::Mrcal), (".qca.txt", Self::Qualisys)].into_iter().find_map(found)
             };
-            return named.or_else(by_ending);
+            let of_storage = || {
+                let formats = |ending: &str| {
+                    let formats = files_with(path, ending).ok()?.into_iter().map(|file| storage(&text(&file)));
+                    // Others that end so are rare.
+                    formats
+                        .flatten()
+                        .next()
+                        .or_else(|| first(ending).filter(|_| ending == ".yml").map(|_| Self::OpenCv))
+                };
+                opencv::ENDINGS.into_iter().find_map(formats)
+            };
+            return named.or_else(model).or_else(by_ending).or_else(of_storage);
         }
         let name = path.file_name()?.to_string_lossy().to_lowercase();
-        let text = || calibration_file::read(path).unwrap_or_default();
+        let storage_or = |other: Self| storage(&text(path)).unwrap_or(other);
         match name.as_str() {
-            calibration_file::FILE if text().contains("[[cameras]]") => Some(Self::Flyrig),
+            calibration_file::FILE if text(path).contains("[[cameras]]") => Some(Self::Flyrig),
             "intri.yml" | "extri.yml" => Some(Self::EasyMocap),
-            "cameras.txt" | "images.txt" => Some(Self::Colmap),
+            "cameras.txt" | "images.txt" | "cameras.bin" | "images.bin" => Some(Self::Colmap),
             name if name.ends_with(".cameramodel") => Some(Self::Mrcal),
-            name if name.ends_with(".qca.txt") || name.ends_with(".xml") => Some(Self::Qualisys),
-            name if name.ends_with(".json") => Some(Self::Nerfstudio),
+            name if name.ends_with(".qca.txt") => Some(Self::Qualisys),
+            name if name.ends_with(".xml") => Some(storage_or(Self::Qualisys)),
+            name if name.ends_with(".json") => Some(storage_or(Self::Nerfstudio)),
             name if name.ends_with(".toml") => Some(Self::Anipose),
-            name if name.ends_with(".yaml") || name.ends_with(".yml") => {
-                Some(if text().contains("cam0:") { Self::Kalibr } else { Self::OpenCv })
-            }
+            name if name.ends_with(".yaml") || name.ends_with(".yml") => Some(storage_or(Self::OpenCv)),
             _ => None,
         }
     }
@@ -165,7 +186,7 @@ impl Format {
                 time_offset_nanos: camera.time_offset_nanos,
                 color: camera.color,
             });
-            Imported { cameras: cameras.collect(), up: Some(rig.world_up) }
+            Imported::new(cameras.collect(), Some(rig.world_up))
         };
         let mut imported = match self {
             Self::Flyrig => {
@@ -173,10 +194,10 @@ impl Format {
                 calibration_file::parse(&file, &calibration_file::read(&file)?)?
             }
             Self::EasyMocap => of_rig(easymocap::load_easymocap(dir(), image_size)?),
-            Self::OpenCv => opencv::read(path)?,
-            Self::Kalibr => kalibr::read(&inside(path, &[kalibr::FILE]))?,
+            Self::OpenCv => opencv::read(path, image_size)?,
+            Self::Kalibr => kalibr::read(&kalibr_file(path)?)?,
             Self::Colmap => colmap::read(dir())?,
-            Self::Nerfstudio => nerfstudio::read(&inside(path, &[nerfstudio::FILE]))?,
+            Self::Nerfstudio => nerfstudio::read(&inside(path, &[nerfstudio::FILE]), image_size)?,
             Self::Qualisys => qualisys::read(&one_file(path, ".qca.txt")?)?,
             Self::Anipose => anipose::read(&inside(path, &[anipose::FILE, "camera_array.toml", "config.toml"]))?,
             Self::Mrcal => mrcal::read(path)?,
@@ -203,18 +224,19 @@ impl Format {
     /// [`CalibError`] names the camera and what the format lacks.
     pub fn write(self, dir: &Path, rig: &Rig) -> Result<Vec<String>, CalibError> {
         rig.validate().map_err(|source| CalibError::Camera { path: dir.to_owned(), source })?;
-        let files: Vec<(String, String)> = match self {
-            Self::Flyrig => vec![(calibration_file::FILE.to_owned(), calibration_file::calibration_toml(rig, &[])?)],
+        let one = |name: &str, text: String| vec![(name.to_owned(), text.into_bytes())];
+        let files: Vec<(String, Vec<u8>)> = match self {
+            Self::Flyrig => one(calibration_file::FILE, calibration_file::calibration_toml(rig, &[])?),
             Self::EasyMocap => {
                 easymocap::save_easymocap(dir, rig)?;
                 return Ok(vec!["intri.yml".to_owned(), "extri.yml".to_owned()]);
             }
             Self::OpenCv => opencv::files(dir, rig)?,
-            Self::Kalibr => vec![(kalibr::FILE.to_owned(), kalibr::text(dir, rig)?)],
+            Self::Kalibr => one(kalibr::FILE, kalibr::text(dir, rig)?),
             Self::Colmap => colmap::files(rig),
-            Self::Nerfstudio => vec![(nerfstudio::FILE.to_owned(), nerfstudio::text(dir, rig)?)],
-            Self::Qualisys => vec![("calibration.qca.txt".to_owned(), qualisys::text(dir, rig)?)],
-            Self::Anipose => vec![(anipose::FILE.to_owned(), anipose::text(rig))],
+            Self::Nerfstudio => one(nerfstudio::FILE, nerfstudio::text(dir, rig)?),
+            Self::Qualisys => one("calibration.qca.txt", qualisys::text(dir, rig)?),
+            Self::Anipose => one(anipose::FILE, anipose::text(rig)),
             Self::Mrcal => mrcal::files(dir, rig)?,
         };
         let is_plain =
@@ -222,11 +244,27 @@ impl Format {
         if let Some((name, _)) = files.iter().find(|(name, _)| !is_plain(name)) {
             return Err(bad(dir, format!("a camera's name makes {name:?} no file name; rename the camera")));
         }
-        for (name, text) in &files {
+        for (name, bytes) in &files {
             let path = dir.join(name);
-            write_whole(&path, |out| out.write_all(text.as_bytes()))
+            write_whole(&path, |out| out.write_all(bytes))
                 .map_err(|error| CalibError::Write { path, reason: error.to_string() })?;
         }
         Ok(files.into_iter().map(|(name, _)| name).collect())
+    }
+}
+
+/// Returns the chain of a folder: Kalibr names it after the recording, and OpenVINS otherwise.
+fn kalibr_file(path: &Path) -> Result<PathBuf, CalibError> {
+    let known = inside(path, &[kalibr::FILE]);
+    if !path.is_dir() || known.is_file() {
+        return Ok(known);
+    }
+    let is_chain = |file: &PathBuf| calibration_file::read(file).is_ok_and(|text| kalibr::is_chain(&text));
+    let files = [files_with(path, ".yaml")?, files_with(path, ".yml")?].concat();
+    let mut chains = files.into_iter().filter(is_chain);
+    match (chains.next(), chains.next()) {
+        (Some(file), None) => Ok(file),
+        (Some(_), Some(_)) => Err(bad(path, "holds several camera chains; name one")),
+        (None, _) => Ok(known),
     }
 }

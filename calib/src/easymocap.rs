@@ -1,7 +1,8 @@
 //! Calibration in the format of EasyMocap and ZJU-MoCap: `intri.yml` and `extri.yml`.
 //!
 //! Per camera `x`: `K_x` 3x3, `dist_x` (k1 k2 p1 p2 k3, or with k4 k5 k6 of the rational model), `Rot_x` 3x3 or `R_x`
-//! as a Rodrigues vector, `T_x`; `x_camera = Rot x_world + T`. Image sizes `H_x`, `W_x` are optional.
+//! as a Rodrigues vector, `T_x`; `x_camera = Rot x_world + T`. Image sizes `H_x`, `W_x` are optional. EasyVolcap and 4K4D write
+//! `D_x` in place of `dist_x`.
 
 use std::{
     collections::BTreeSet,
@@ -11,22 +12,25 @@ use std::{
 use flyrig_types::{Camera, CameraError, CameraId, Intrinsics, Isometry, Lens, MAX_IMAGE_SIDE, Rig};
 use glam::{DMat3, DQuat, DVec2, DVec3};
 
-use crate::convert::shared::{opencv_coefficients, opencv_lens, rotation_of};
+use crate::convert::shared::{opencv_coefficients, opencv_lens, refuse_unknown, rotation_of};
 use crate::error::CalibError;
+use crate::up::{level_up, nearest_axis};
 use crate::yaml::{Matrix, YamlFile, YamlWriter};
 
 const INTRINSICS: &str = "intri.yml";
 const EXTRINSICS: &str = "extri.yml";
+/// Largest angle between two statements of one rotation, radians.
+const SAME_ROTATION: f64 = 1e-3;
 
 /// Reads `intri.yml` and `extri.yml` of a folder. `image_size` gives width and height of a camera's images in pixels
 /// for files that lack them, and is checked against those that contain them. The world's axes stay as they are; the up
-/// direction is estimated from the cameras ([`Rig::guess_world_up`]).
+/// direction is the world axis that the cameras suggest.
 ///
 /// # Errors
 /// [`CalibError`] names the file, the camera and the fix.
 pub fn load_easymocap(dir: &Path, image_size: &dyn Fn(&CameraId) -> Option<(u32, u32)>) -> Result<Rig, CalibError> {
-    let intri = YamlFile::open(dir.join(INTRINSICS))?;
-    let extri = YamlFile::open(dir.join(EXTRINSICS))?;
+    let intri = open(dir, INTRINSICS)?;
+    let extri = open(dir, EXTRINSICS)?;
     let with_intrinsics = camera_names(&intri, "K_", "K_<camera>")?;
     let with_extrinsics = camera_names(&extri, "T_", "T_<camera>")?;
     for (names, others, file, other) in
@@ -45,10 +49,17 @@ pub fn load_easymocap(dir: &Path, image_size: &dyn Fn(&CameraId) -> Option<(u32,
             Ok(Camera { time_offset_nanos: 0, color: Default::default(), id, intrinsics, camera_from_world })
         })
         .collect::<Result<Vec<_>, CalibError>>()?;
-    let world_up = Rig::guess_world_up(&cameras);
+    let world_up = nearest_axis(level_up(&cameras));
     let rig = Rig { cameras, world_up };
     validate(&rig, dir)?;
     Ok(rig)
+}
+
+fn open(dir: &Path, name: &str) -> Result<YamlFile, CalibError> {
+    let file = YamlFile::open(dir.join(name))?;
+    let prefixes = file.keys().map(|key| key.split_once('_').map_or(key, |(prefix, _)| prefix));
+    refuse_unknown(prefixes, &[]).map_err(|problem| CalibError::Format { path: file.path().to_owned(), problem })?;
+    Ok(file)
 }
 
 fn validate(rig: &Rig, dir: &Path) -> Result<(), CalibError> {
@@ -57,10 +68,9 @@ fn validate(rig: &Rig, dir: &Path) -> Result<(), CalibError> {
 
 /// Returns the cameras of a file: its `names`, or the suffix of every key that begins with `prefix`.
 fn camera_names(file: &YamlFile, prefix: &str, expected: &'static str) -> Result<Vec<CameraId>, CalibError> {
-    let keys = file.keys()?;
     let names = file.strings("names").unwrap_or_else(|| {
-        let of = |key: &String| key.strip_prefix(prefix).map(str::to_owned);
-        let sorted: BTreeSet<String> = keys.iter().filter_map(of).collect();
+        let of = |key: &str| key.strip_prefix(prefix).map(str::to_owned);
+        let sorted: BTreeSet<String> = file.keys().filter_map(of).collect();
         sorted.into_iter().collect()
     });
     if names.is_empty() {
@@ -139,9 +149,22 @@ fn read_intrinsics(file: &YamlFile, id: &CameraId, pictures: Option<(u32, u32)>)
     })
 }
 
+/// Reads EasyMocap's `dist_CAM` or EasyVolcap's `D_CAM`.
 fn read_lens(file: &YamlFile, id: &CameraId) -> Result<Lens, CalibError> {
-    let entry = Entry::new(file, id, "dist");
-    let matrix = entry.required("write five zeros when the lens does not distort")?;
+    // EasyVolcap's angles of a fisheye.
+    let fisheye = Entry::new(file, id, "rdist");
+    if fisheye.read()?.is_some_and(|matrix| matrix.values.iter().any(|value| *value != 0.0)) {
+        return Err(fisheye.wrong("is a fisheye's".to_owned(), "undistort the images, or calibrate with dist"));
+    }
+    let (entry, other) = (Entry::new(file, id, "dist"), Entry::new(file, id, "D"));
+    let (matrix, entry) = match (entry.read()?, other.read()?) {
+        (Some(matrix), Some(second)) if matrix.values != second.values => {
+            return Err(entry.wrong(format!("and {} differ", other.key), "take the wrong one out"));
+        }
+        (Some(matrix), _) => (matrix, entry),
+        (None, Some(matrix)) => (matrix, other),
+        (None, None) => return Err(entry.missing("write five zeros when the lens does not distort")),
+    };
     if matrix.rows != 1 && matrix.cols != 1 || ![4, 5, 8, 12, 14].contains(&matrix.values.len()) {
         return Err(entry.wrong_shape(&matrix, "a row of 4, 5, 8, 12 or 14 numbers"));
     }
@@ -154,7 +177,8 @@ fn image_size(file: &YamlFile, id: &CameraId, pictures: Option<(u32, u32)>) -> R
         |prefix: &str| -> Result<Option<u32>, CalibError> {
             let entry = Entry::new(file, id, prefix);
             match file.number(&entry.key) {
-                None => Ok(None),
+                // EasyVolcap writes -1 or 0 for sizes that it does not know.
+                None | Some(-1.0 | 0.0) => Ok(None),
                 Some(pixels) if pixels >= 1.0 && pixels <= f64::from(MAX_IMAGE_SIDE) && pixels.fract() == 0.0 => {
                     Ok(Some(pixels as u32))
                 }
@@ -173,18 +197,24 @@ fn image_size(file: &YamlFile, id: &CameraId, pictures: Option<(u32, u32)>) -> R
 }
 
 fn read_extrinsics(file: &YamlFile, id: &CameraId) -> Result<Isometry, CalibError> {
-    let entry = Entry::new(file, id, "Rot");
-    let rotation = match entry.read()? {
-        Some(matrix) => rotation(&entry, &matrix)?,
-        None => {
-            let rodrigues = Entry::new(file, id, "R");
-            let matrix = rodrigues.read()?.ok_or_else(|| entry.missing("or give a Rodrigues vector R"))?;
-            if matrix.values.len() == 9 {
-                rotation(&rodrigues, &matrix)?
-            } else {
-                DQuat::from_scaled_axis(rodrigues.vector3(&matrix)?)
+    let (entry, vector) = (Entry::new(file, id, "Rot"), Entry::new(file, id, "R"));
+    let of_vector = match vector.read()? {
+        Some(matrix) if matrix.values.len() == 9 => Some(rotation(&vector, &matrix)?),
+        Some(matrix) => Some(DQuat::from_scaled_axis(vector.vector3(&matrix)?)),
+        None => None,
+    };
+    let rotation = match (entry.read()?, of_vector) {
+        (Some(matrix), of_vector) => {
+            let of_matrix = rotation(&entry, &matrix)?;
+            if of_vector.is_some_and(|other| other.angle_between(of_matrix) > SAME_ROTATION) {
+                return Err(
+                    entry.wrong(format!("and {} are different rotations", vector.key), "take the wrong one out")
+                );
             }
+            of_matrix
         }
+        (None, Some(of_vector)) => of_vector,
+        (None, None) => return Err(entry.missing("or give a Rodrigues vector R")),
     };
     let entry = Entry::new(file, id, "T");
     let translation = entry.vector3(&entry.required("calibrate the position of this camera")?)?;
@@ -241,7 +271,7 @@ pub(crate) fn load_lenses(
     dir: &Path,
     image_size: &dyn Fn(&CameraId) -> Option<(u32, u32)>,
 ) -> Result<Vec<(CameraId, Intrinsics)>, CalibError> {
-    let intri = YamlFile::open(dir.join(INTRINSICS))?;
+    let intri = open(dir, INTRINSICS)?;
     let names = camera_names(&intri, "K_", "K_<camera>")?;
     names.into_iter().map(|id| Ok((id.clone(), read_intrinsics(&intri, &id, image_size(&id))?))).collect()
 }

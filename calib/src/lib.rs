@@ -30,11 +30,14 @@ mod print;
 mod projection;
 mod rig;
 mod start;
+mod storage_xml;
 #[doc(hidden)]
 pub mod testing;
 mod uncertainty;
+mod up;
 mod watch;
 mod yaml;
+mod yaml_value;
 
 pub use board::{Board, Pattern};
 pub use bundle::{BoardShot, BoardView};

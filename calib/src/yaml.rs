@@ -1,19 +1,23 @@
-//! Reader and writer of the YAML subset of OpenCV's FileStorage: keys, scalars, lists, matrices.
-//!
-//! OpenCV's own reader hangs on some damaged files; hence this one.
+//! YAML files of other programs, read into a tree of bounded size; OpenCV's FileStorage in all three of its forms (YAML, XML and
+//! JSON, which is YAML too), and a writer of the first.
 
 use std::{
+    collections::BTreeMap,
     fmt::Write as _,
     io::Write as _,
     path::{Path, PathBuf},
 };
 
 use flyrig_types::CameraId;
+use saphyr_parser::{Event, Parser, ScalarStyle, ScanError, Span, Tag};
 
+use crate::calibration_file;
 use crate::error::CalibError;
+use crate::storage_xml;
+use crate::yaml_value::{MAX_DEPTH, Map, Value};
 
-/// Maximum file size: calibrations are small, larger files are something else.
-const MAX_BYTES: usize = 16 << 20;
+/// Most nodes of a file, copies by aliases included: a calibration with its corners has some ten thousand.
+const MAX_NODES: usize = 500_000;
 
 /// Matrix of a file, row by row.
 #[derive(Debug, Clone, PartialEq)]
@@ -23,113 +27,212 @@ pub(crate) struct Matrix {
     pub values: Vec<f64>,
 }
 
-/// Value of a file.
-#[derive(Debug, Clone, PartialEq)]
-pub(crate) enum Value {
-    /// Scalar text, and whether it was quoted.
-    Scalar(String, bool),
-    List(Vec<Value>),
-    Map(Vec<(String, Value)>),
-}
-
-impl Value {
-    /// Returns a number; `None` for anything else.
-    pub fn number(&self) -> Option<f64> {
-        let Self::Scalar(text, false) = self else { return None };
-        match text.as_str() {
-            ".Inf" | ".inf" | "+.Inf" => Some(f64::INFINITY),
-            "-.Inf" | "-.inf" => Some(f64::NEG_INFINITY),
-            ".NaN" | ".Nan" | ".nan" => Some(f64::NAN),
-            // Rust reads words like "inf" and "nan" too, YAML does not.
-            text if text.starts_with(|c: char| c.is_ascii_digit() || "+-.".contains(c)) => text.parse().ok(),
-            _ => None,
-        }
-    }
-
-    /// Returns a value of a map.
-    pub fn get(&self, key: &str) -> Option<&Self> {
-        let Self::Map(entries) = self else { return None };
-        entries.iter().find(|(name, _)| name == key).map(|(_, value)| value)
-    }
-
-    /// Returns a scalar as text, quoted or not.
-    pub fn word(&self) -> Option<&str> {
-        let Self::Scalar(text, _) = self else { return None };
-        Some(text)
-    }
-
-    /// Returns a list of numbers.
-    pub fn numbers(&self) -> Option<Vec<f64>> {
-        let Self::List(values) = self else { return None };
-        values.iter().map(Self::number).collect()
-    }
-
-    /// Returns a list of lists of numbers.
-    pub fn rows(&self) -> Option<Vec<Vec<f64>>> {
-        let Self::List(values) = self else { return None };
-        values.iter().map(Self::numbers).collect()
-    }
-}
-
-/// Reads a plain YAML file of nested maps and lists, as Kalibr writes them.
-pub(crate) fn parse_tree(path: &Path) -> Result<Value, CalibError> {
-    let bytes = std::fs::read(path).map_err(|source| CalibError::Read { path: path.to_owned(), source })?;
-    let parsed = text_of(&bytes).and_then(|text| Lines::new(text).map());
-    parsed.map(Value::Map).map_err(|reason| CalibError::Format {
+/// Reads a YAML file, as Kalibr writes it.
+pub(crate) fn parse_tree(path: &Path) -> Result<Map, CalibError> {
+    parse(&calibration_file::read(path)?).map_err(|reason| CalibError::Format {
         path: path.to_owned(),
         problem: format!("is no YAML of a camera chain ({reason}); export it again"),
     })
 }
 
-/// Checks that bytes are UTF-8 text of an acceptable length.
-fn text_of(bytes: &[u8]) -> Result<&str, String> {
-    if bytes.len() > MAX_BYTES {
-        return Err(format!("it has {} bytes, at most {MAX_BYTES}", bytes.len()));
+/// Parses the maps of all documents of a file into one.
+fn parse(text: &str) -> Result<Map, String> {
+    // OpenCV's header is no directive of YAML.
+    let is_header = text.trim_start().starts_with("%YAML");
+    let body =
+        if is_header { text.find('%').and_then(|from| text[from..].find('\n').map(|to| from + to)) } else { Some(0) };
+    let body = body.map_or("", |from| &text[from..]);
+    let skipped = text[..text.len() - body.len()].matches('\n').count();
+    let mut tree = Tree::default();
+    // The parser looks ahead to the end of a list in brackets: their entries are counted before.
+    tree.count(body.bytes().filter(|byte| matches!(byte, b',' | b'[' | b'{')).count())?;
+    tree.nodes = 0;
+    for event in Parser::new_from_str(body) {
+        let place = |line: usize, problem: &str| format!("line {}: {problem}", skipped + line);
+        let (event, span): (Event<'_>, Span) =
+            event.map_err(|error: ScanError| place(error.marker().line(), error.info()))?;
+        tree.add(event).map_err(|problem| place(span.start.line(), &problem))?;
     }
-    let text = std::str::from_utf8(bytes).ok().filter(|text| !text.contains('\0')).ok_or("it is not text")?;
-    Ok(text.trim_start_matches('\u{feff}'))
+    Ok(tree.root)
+}
+
+/// List or map whose end was not read yet.
+struct Open {
+    anchor: usize,
+    nodes_before: usize,
+    content: Content,
+}
+
+enum Content {
+    List(Vec<Value>),
+    /// Entries, the key that waits for its value, and the values of merge keys.
+    Map(Map, Option<String>, Vec<Value>),
+}
+
+/// Tree under construction.
+#[derive(Default)]
+struct Tree {
+    open: Vec<Open>,
+    /// Values with an anchor, and their numbers of nodes.
+    anchors: BTreeMap<usize, (Value, usize)>,
+    nodes: usize,
+    root: Map,
+}
+
+impl Tree {
+    fn add(&mut self, event: Event<'_>) -> Result<(), String> {
+        match event {
+            Event::Scalar(text, style, anchor, tag) => {
+                let before = self.count(1)?;
+                let is_number = |tag: &Tag| tag.is_yaml_core_schema() && matches!(tag.suffix.as_str(), "float" | "int");
+                let is_quoted = style != ScalarStyle::Plain && !tag.is_some_and(|tag| is_number(&tag));
+                self.close(Value::Scalar(text.into_owned(), is_quoted), anchor, before)
+            }
+            Event::Alias(anchor) => {
+                let (value, nodes) = self.anchors.get(&anchor).cloned().ok_or("an alias inside of its own anchor")?;
+                let before = self.count(nodes)?;
+                self.close(value, 0, before)
+            }
+            Event::SequenceStart(anchor, _) => self.open(anchor, Content::List(Vec::new())),
+            Event::MappingStart(anchor, _) => self.open(anchor, Content::Map(Map::new(), None, Vec::new())),
+            Event::SequenceEnd | Event::MappingEnd => {
+                let Some(Open { anchor, nodes_before, content }) = self.open.pop() else { return Ok(()) };
+                let value = match content {
+                    Content::List(values) => Value::List(values),
+                    Content::Map(mut entries, _, merged) => {
+                        merged.into_iter().try_for_each(|value| merge(&mut entries, value))?;
+                        Value::Map(entries)
+                    }
+                };
+                self.close(value, anchor, nodes_before)
+            }
+            Event::Nothing | Event::StreamStart | Event::StreamEnd | Event::DocumentStart(_) | Event::DocumentEnd => {
+                Ok(())
+            }
+        }
+    }
+
+    /// Counts nodes, and returns their number before.
+    fn count(&mut self, nodes: usize) -> Result<usize, String> {
+        let before = self.nodes;
+        self.nodes = before.saturating_add(nodes);
+        if self.nodes > MAX_NODES {
+            return Err(format!("more than {MAX_NODES} values; this is no calibration"));
+        }
+        Ok(before)
+    }
+
+    fn open(&mut self, anchor: usize, content: Content) -> Result<(), String> {
+        let nodes_before = self.count(1)?;
+        if self.open.len() >= MAX_DEPTH {
+            return Err(format!("nested more than {MAX_DEPTH} deep; this is no calibration"));
+        }
+        self.open.push(Open { anchor, nodes_before, content });
+        Ok(())
+    }
+
+    /// Puts a complete value into the list or map around it.
+    fn close(&mut self, value: Value, anchor: usize, nodes_before: usize) -> Result<(), String> {
+        if anchor != 0 {
+            let nodes = self.nodes - nodes_before;
+            self.count(nodes)?;
+            self.anchors.insert(anchor, (value.clone(), nodes));
+        }
+        let Some(around) = self.open.last_mut() else {
+            return match value {
+                Value::Map(entries) => entries.into_iter().try_for_each(|(key, value)| put(&mut self.root, key, value)),
+                // An empty document is an empty scalar.
+                Value::Scalar(text, false) if text.is_empty() => Ok(()),
+                Value::Scalar(..) | Value::List(_) => Err("expected keys with values".to_owned()),
+            };
+        };
+        match &mut around.content {
+            Content::List(values) => values.push(value),
+            Content::Map(entries, waiting, merged) => match (waiting.take(), value) {
+                (None, Value::Scalar(key, _)) => *waiting = Some(key),
+                (None, _) => return Err("a key that is a list or a map".to_owned()),
+                (Some(key), value) if key == "<<" => merged.push(value),
+                (Some(key), value) => put(entries, key, value)?,
+            },
+        }
+        Ok(())
+    }
+}
+
+fn put(entries: &mut Map, key: String, value: Value) -> Result<(), String> {
+    if entries.contains_key(&key) {
+        return Err(format!("key {:?} is there twice; take one out", shortened(&key)));
+    }
+    entries.insert(key, value);
+    Ok(())
+}
+
+/// Adds the keys of the map, or maps, of a merge key; keys that stand in the map itself replace them.
+fn merge(entries: &mut Map, value: Value) -> Result<(), String> {
+    match value {
+        Value::Map(others) => {
+            for (key, value) in others {
+                entries.entry(key).or_insert(value);
+            }
+            Ok(())
+        }
+        Value::List(maps) => maps.into_iter().try_for_each(|map| merge(entries, map)),
+        Value::Scalar(..) => Err("<< without a map".to_owned()),
+    }
+}
+
+fn shortened(text: &str) -> String {
+    text.chars().take(40).collect()
 }
 
 /// Parsed file.
 pub(crate) struct YamlFile {
     path: PathBuf,
-    entries: Vec<(String, Value)>,
+    root: Map,
 }
 
 impl YamlFile {
     pub fn open(path: PathBuf) -> Result<Self, CalibError> {
-        let bytes = match std::fs::read(&path) {
-            Ok(bytes) => bytes,
-            Err(source) => return Err(CalibError::Read { path, source }),
-        };
-        match Self::parse(&bytes) {
-            Ok(entries) => Ok(Self { path, entries }),
+        let text = calibration_file::read(&path)?;
+        match Self::parse(&text) {
+            Ok(root) => Ok(Self { path, root }),
             Err(reason) => Err(CalibError::Parse { path, reason }),
         }
     }
 
-    fn parse(bytes: &[u8]) -> Result<Vec<(String, Value)>, String> {
-        let text = text_of(bytes)?;
-        if !text.trim_start().starts_with("%YAML") {
-            return Err("it does not begin with %YAML".to_owned());
-        }
-        Lines::new(text).map()
+    fn parse(text: &str) -> Result<Map, String> {
+        let root = match text.trim_start().chars().next() {
+            Some('<') => storage_xml::parse(text)?,
+            // OpenCV puts comments into JSON, each on a line of its own.
+            Some('{') => {
+                let lines = text.lines().map(|line| if line.trim_start().starts_with("//") { "" } else { line });
+                parse(&lines.collect::<Vec<_>>().join("\n"))?
+            }
+            _ => parse(text)?,
+        };
+        if root.is_empty() { Err("no keys in it".to_owned()) } else { Ok(root) }
     }
 
     pub fn path(&self) -> &Path {
         &self.path
     }
 
-    fn get(&self, key: &str) -> Option<&Value> {
-        self.entries.iter().find(|(name, _)| name == key).map(|(_, value)| value)
+    /// Returns a value of the top level.
+    pub fn get(&self, key: &str) -> Option<&Value> {
+        self.root.get(key)
+    }
+
+    /// Returns the first of the keys that the file has; longer ones in any case, since OpenCV's sample changed it.
+    pub fn key(&self, names: &[&str]) -> Option<&str> {
+        let is_named =
+            |key: &&str| names.iter().any(|name| name == key || name.len() > 1 && name.eq_ignore_ascii_case(key));
+        let exact = names.iter().find_map(|name| self.root.get_key_value(*name)).map(|(key, _)| key.as_str());
+        exact.or_else(|| self.keys().find(is_named))
     }
 
     /// Returns every key of the top level.
-    pub fn keys(&self) -> Result<Vec<String>, CalibError> {
-        if self.entries.is_empty() {
-            return Err(CalibError::Parse { path: self.path.clone(), reason: "no keys in it".to_owned() });
-        }
-        Ok(self.entries.iter().map(|(key, _)| key.clone()).collect())
+    pub fn keys(&self) -> impl Iterator<Item = &str> {
+        self.root.keys().map(String::as_str)
     }
 
     /// Returns a list of strings; `None` when it is missing or holds anything else (YAML reads a bare 00 as the number
@@ -160,16 +263,25 @@ impl YamlFile {
             mend: "export or redo the calibration of this camera",
         };
         let Some(value) = self.get(key) else { return Ok(None) };
+        // ROS writes some vectors as plain lists.
+        if let Some(values) = value.numbers() {
+            return match values.iter().find(|value| !value.is_finite()) {
+                Some(value) => Err(broken(format!("holds {value}, not a finite number"))),
+                None => Ok(Some(Matrix { rows: 1, cols: values.len(), values })),
+            };
+        }
         if !matches!(value, Value::Map(_)) {
             return Err(broken("is not a matrix".to_owned()));
+        }
+        if value.get("data").and_then(Value::word).is_some_and(|text| !text.is_empty()) {
+            return Err(broken("holds base64; write it without FileStorage's BASE64".to_owned()));
         }
         let size = |name: &str| {
             let number = value.get(name)?.number().filter(|n| n.fract() == 0.0 && (0.0..=1e6).contains(n))?;
             Some(number as usize)
         };
         let read = || -> Option<(usize, usize, Vec<f64>)> {
-            let Some(Value::List(data)) = value.get("data") else { return None };
-            Some((size("rows")?, size("cols")?, data.iter().map(Value::number).collect::<Option<_>>()?))
+            Some((size("rows")?, size("cols")?, value.get("data")?.numbers()?))
         };
         let (rows, cols, values) =
             read().ok_or_else(|| broken("cannot be read as a matrix (rows, cols or data is no number)".to_owned()))?;
@@ -182,132 +294,6 @@ impl YamlFile {
             None => Ok(Some(Matrix { rows, cols, values })),
         }
     }
-}
-
-/// Non-empty lines, with number and indentation.
-struct Lines<'a> {
-    lines: Vec<(usize, usize, &'a str)>,
-    at: usize,
-}
-
-impl<'a> Lines<'a> {
-    fn new(text: &'a str) -> Self {
-        let line = |(number, line): (usize, &'a str)| {
-            let body = line.trim();
-            let is_content = !body.is_empty() && !body.starts_with(['%', '#']) && body != "---" && body != "...";
-            is_content.then_some((number + 1, line.len() - line.trim_start().len(), body))
-        };
-        Self { lines: text.lines().enumerate().filter_map(line).collect(), at: 0 }
-    }
-
-    /// Parses the top level.
-    fn map(mut self) -> Result<Vec<(String, Value)>, String> {
-        let entries = self.entries(0, true)?;
-        match self.lines.get(self.at) {
-            Some((number, ..)) => Err(format!("line {number} is indented without a key above it")),
-            None => Ok(entries),
-        }
-    }
-
-    /// Parses the keys at one indentation. Only those of the top level may hold keys themselves: these files nest no
-    /// deeper.
-    fn entries(&mut self, indent: usize, is_top: bool) -> Result<Vec<(String, Value)>, String> {
-        let mut entries: Vec<(String, Value)> = Vec::new();
-        while let Some(&(number, found, body)) = self.lines.get(self.at).filter(|line| line.1 == indent) {
-            let Some((key, rest)) = key(body) else {
-                return Err(format!("line {number}: expected a key, found {:?}", shortened(body)));
-            };
-            self.at += 1;
-            // A tag says what the keys below are; they say it themselves.
-            let rest = match rest.strip_prefix("!!") {
-                Some(tag) => tag.split_once(char::is_whitespace).map_or("", |(_, rest)| rest).trim(),
-                None => rest,
-            };
-            let value = if rest.is_empty() {
-                self.below(found, is_top)?
-            } else if rest.starts_with('[') {
-                self.flow(number, rest)?
-            } else {
-                scalar(rest)
-            };
-            entries.push((key, value));
-        }
-        Ok(entries)
-    }
-
-    /// Parses the value below a key.
-    fn below(&mut self, indent: usize, is_top: bool) -> Result<Value, String> {
-        let Some(&(number, inner, body)) = self.lines.get(self.at) else {
-            return Ok(Value::Scalar(String::new(), false));
-        };
-        let is_item = |body: &str| body == "-" || body.starts_with("- ");
-        if is_item(body) && inner >= indent {
-            let mut items = Vec::new();
-            while let Some(&(number, _, body)) =
-                self.lines.get(self.at).filter(|line| line.1 == inner && is_item(line.2))
-            {
-                self.at += 1;
-                let item = body[1..].trim();
-                items.push(if item.starts_with('[') { self.flow(number, item)? } else { scalar(item) });
-            }
-            return Ok(Value::List(items));
-        }
-        if inner <= indent {
-            return Ok(Value::Scalar(String::new(), false));
-        }
-        if !is_top {
-            return Err(format!("line {number} is nested deeper than a calibration"));
-        }
-        Ok(Value::Map(self.entries(inner, false)?))
-    }
-
-    /// Parses `[ a, b, c ]`, over any number of lines.
-    fn flow(&mut self, number: usize, first: &str) -> Result<Value, String> {
-        let mut items = Vec::new();
-        let mut rest = &first[1..];
-        loop {
-            let (inside, is_end) = rest.split_once(']').map_or((rest, false), |(inside, _)| (inside, true));
-            if inside.contains(['[', '{']) {
-                return Err(format!("line {number}: a list inside of a list"));
-            }
-            items.extend(inside.split(',').map(str::trim).filter(|item| !item.is_empty()).map(scalar));
-            if is_end {
-                return Ok(Value::List(items));
-            }
-            let Some((_, _, body)) = self.lines.get(self.at) else {
-                return Err(format!("line {number}: a list without its end"));
-            };
-            rest = body;
-            self.at += 1;
-        }
-    }
-}
-
-/// Splits `key: rest`; the key may be quoted.
-fn key(body: &str) -> Option<(String, &str)> {
-    let (key, rest) = match body.strip_prefix('"') {
-        Some(quoted) => {
-            let (key, rest) = quoted.split_once('"')?;
-            (key, rest.trim_start().strip_prefix(':')?)
-        }
-        None => body.split_once(": ").or_else(|| Some((body.strip_suffix(':')?, "")))?,
-    };
-    let key = key.trim();
-    (!key.is_empty()).then(|| (key.to_owned(), rest.trim()))
-}
-
-fn scalar(text: &str) -> Value {
-    for quote in ['"', '\''] {
-        if let Some(inner) = text.strip_prefix(quote).and_then(|text| text.split_once(quote)) {
-            return Value::Scalar(inner.0.to_owned(), true);
-        }
-    }
-    let text = text.split(" #").next().unwrap_or_default().trim();
-    Value::Scalar(text.to_owned(), false)
-}
-
-fn shortened(text: &str) -> String {
-    text.chars().take(40).collect()
 }
 
 /// File under construction.

@@ -212,7 +212,7 @@ fn broken_files_are_refused_with_file_camera_and_mend() {
         (extri(rot, "1e200, 0., 0., 0., 0., -1e200, 0., 1e200, 0."), "camera 00: Rot_00 is no rotation"),
         (extri("[ 1.5707963267948966, 0., 0. ]", "[ 1., 2. ]"), "extri.yml: camera b: R_b cannot be read as a matrix"),
         (intri("K_b: !!opencv-matrix", "K_b: 7\nZ: !!opencv-matrix"), "camera b: K_b is not a matrix; export or redo"),
-        (refusal("", EXTRI), "intri.yml: is not a YAML file of OpenCV's FileStorage (it does not begin with %YAML)"),
+        (refusal("", EXTRI), "intri.yml: is not a YAML file of OpenCV's FileStorage (no keys in it)"),
         (refusal("%YAML:1.0\n---\n", EXTRI), "intri.yml: "),
         (
             refusal("%YAML:1.0\n---\nfoo: 1\n", EXTRI),
@@ -222,7 +222,7 @@ fn broken_files_are_refused_with_file_camera_and_mend() {
             refusal("%YAML:1.0\n---\nK_00: !!opencv-matrix\n  rows: [\n", EXTRI),
             "intri.yml: is not a YAML file of OpenCV's",
         ),
-        (refusal(INTRI, "\u{0}\u{1}"), "extri.yml: is not a YAML file of OpenCV's FileStorage (it is not text)"),
+        (refusal(INTRI, "\u{0}\u{1}"), "extri.yml: cannot be read: it is not text in UTF-8"),
     ];
     for (found, expected) in cases {
         assert!(found.contains(expected), "expected: {expected}\nfound:    {found}");

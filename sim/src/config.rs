@@ -114,7 +114,7 @@ pub enum MotionKind {
     BySeed,
     /// BVH clip.
     Bvh,
-    /// First animation of a glTF file.
+    /// First animation of a glTF file that moves.
     Gltf,
 }
 

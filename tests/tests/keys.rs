@@ -39,7 +39,8 @@ fn a_key_file_is_all_that_another_computer_needs() {
 
     let made = done(&["keys", "new", "stage", "--host", "127.0.0.1", "--port", &port]);
     assert!(made.stdout.trim() == "stage-keys" && made.stderr.contains("keys = \"stage-keys\""), "{made:?}");
-    done(&["keys", "add", "left-pc", "--role", "cameras"]);
+    done(&["keys", "add", "left-pc", "--role", "cameras", "--camera", "00", "--camera", "01"]);
+    done(&["keys", "add", "one", "--role", "cameras", "--camera", "00"]);
     done(&["keys", "add", "desk"]);
     let listed = done(&["keys", "list"]).stdout;
     for (name, role) in [("left-pc", "cameras"), ("desk", "viewer")] {
@@ -47,7 +48,9 @@ fn a_key_file_is_all_that_another_computer_needs() {
     }
     refused(&["keys", "add", "desk"], "desk.key is there already");
     refused(&["keys", "new", "stage", "--host", "127.0.0.1"], "stage-keys: is there already");
-    refused(&["keys", "revoke", "nobody"], "'nobody' has no key; known: left-pc, desk");
+    refused(&["keys", "revoke", "nobody"], "'nobody' has no key; known: left-pc, one, desk");
+    refused(&["keys", "add", "two", "--camera", "00"], "add --role cameras");
+    refused(&["capture", "cameras.toml", "--key", "one.key"], "camera 01: the key of 'one' is for 00");
     refused(&["capture", "cameras.toml", "--key", "desk.key"], "desk.key: is a key of role viewer");
     refused(&["watch", "left-pc.key", "--seconds", "1"], "left-pc.key: is a key of role cameras");
     refused(&["watch", "cameras.toml", "--seconds", "1"], "cameras.toml: is no key");
@@ -87,4 +90,78 @@ fn a_key_file_is_all_that_another_computer_needs() {
     std::fs::remove_file(folder.path().join("desk.key")).unwrap();
     let renewed = done(&["keys", "renew", "desk"]);
     assert!(renewed.stderr.contains("the old key of 'desk' is refused"), "{}", renewed.stderr);
+}
+
+/// Returns the names of valid keys, as `keys list` prints them.
+fn valid_names(folder: &std::path::Path) -> Vec<String> {
+    let listed = run(PROGRAM, &["keys", "list"], folder).unwrap();
+    assert_eq!(listed.code, Some(0), "{listed:?}");
+    let valid = |line: &str| line.ends_with(" valid").then(|| line.split(' ').next().map(str::to_owned)).flatten();
+    let mut names: Vec<String> = listed.stdout.lines().filter_map(valid).collect();
+    names.sort();
+    names
+}
+
+fn key_files(folder: &std::path::Path) -> Vec<String> {
+    let entries = std::fs::read_dir(folder).unwrap().map(|entry| entry.unwrap().file_name().into_string().unwrap());
+    let mut names: Vec<String> = entries.filter_map(|name| name.strip_suffix(".key").map(str::to_owned)).collect();
+    names.sort();
+    names
+}
+
+fn spawn(args: &[&str], folder: &std::path::Path) -> Running {
+    let mut command = Command::new(PROGRAM);
+    command.args(args).current_dir(folder).stdout(Stdio::null()).stderr(Stdio::null());
+    Running(command.spawn().unwrap())
+}
+
+#[test]
+fn a_hundred_commands_at_once_lose_nothing() {
+    let folder = tempfile::tempdir().unwrap();
+    let path = folder.path();
+    let done = |args: &[&str]| assert_eq!(run(PROGRAM, args, path).unwrap().code, Some(0), "{args:?}");
+    done(&["keys", "new", "stage", "--host", "127.0.0.1"]);
+    for n in 0..20 {
+        done(&["keys", "add", &format!("old{n:02}")]);
+    }
+    let mut commands = Vec::new();
+    for n in 0..80 {
+        commands.push(spawn(&["keys", "add", &format!("new{n:02}")], path));
+        if n % 8 == 0 {
+            commands.push(spawn(&["keys", "revoke", &format!("old{:02}", n / 8)], path));
+            let name = format!("old{:02}", 10 + n / 8);
+            commands.push(spawn(&["keys", "renew", &name, "--out", &format!("{name}b.key")], path));
+        }
+    }
+    for command in &mut commands {
+        assert!(command.0.wait().unwrap().success());
+    }
+    let mut expected: Vec<String> = (0..80).map(|n| format!("new{n:02}")).collect();
+    expected.extend((10..20).map(|n| format!("old{n:02}")));
+    assert_eq!(valid_names(path), expected, "every command took effect, and every revocation holds");
+    let mut files = expected;
+    files.extend((0..10).map(|n| format!("old{n:02}")));
+    files.extend((10..20).map(|n| format!("old{n:02}b")));
+    files.sort();
+    assert_eq!(key_files(path), files);
+}
+
+#[test]
+fn commands_that_are_killed_leave_keys_and_list_equal() {
+    let folder = tempfile::tempdir().unwrap();
+    let path = folder.path();
+    let made = run(PROGRAM, &["keys", "new", "stage", "--host", "127.0.0.1"], path).unwrap();
+    assert_eq!(made.code, Some(0), "{made:?}");
+    let started = std::time::Instant::now();
+    drop(run(PROGRAM, &["keys", "add", "desk"], path).unwrap());
+    let whole = started.elapsed();
+    for n in 0..40u32 {
+        // Killed at moments spread over the time that the command takes.
+        let command = spawn(&["keys", "add", &format!("new{n:02}")], path);
+        std::thread::sleep(whole * n / 30);
+        drop(command);
+        let valid = valid_names(path);
+        assert_eq!(key_files(path), valid, "after {n} commands");
+    }
+    assert!(key_files(path).len() > 1, "some commands came to their end");
 }

@@ -21,12 +21,7 @@ use crate::{simulator_file, toml_errors::explain};
 pub const DEFAULT_TOML: &str = include_str!("../assets/default.toml");
 
 /// Tables and keys of earlier versions, and what to do about each.
-const REMOVED: [(&str, &str); 10] = [
-    (
-        "sim",
-        "the simulated rig has a file of its own: move the table there, its names without `sim.` ([sim.motion] becomes [motion]), and \
-         name that file as source.path; `flyrig sim print` prints its defaults",
-    ),
+const REMOVED: [(&str, &str); 9] = [
     ("body.pose", "it is a key of [perception]"),
     ("body.masks", "it is a key of [perception]"),
     ("body.shape", "it is a key of [perception]"),
@@ -44,8 +39,8 @@ const REMOVED: [(&str, &str); 10] = [
 pub struct Config {
     pub rig: RigSection,
     pub source: SourceSection,
-    /// Simulated rig, from the file that `source.path` names where `source.kind` is "sim".
-    #[serde(skip)]
+    /// Simulated rig, from the file that `source.path` names where `source.kind` is "sim", or written here.
+    #[serde(skip_serializing)]
     pub sim: SimConfig,
     pub sync: SyncSettings,
     pub calibration: CalibrationSection,
@@ -150,13 +145,18 @@ impl Config {
     /// # Errors
     /// Those of [`Self::load`].
     pub fn load_for_capture(path: &Path) -> Result<Self> {
-        let text = std::fs::read_to_string(path)
+        let text = flyrig_types::read_text(path)
             .with_context(|| format!("cannot read the configuration {}", path.display()))?;
         let mut config = Self::parse_values(&text).with_context(|| in_file(path))?;
         if config.source.kind != SourceKind::Cameras {
             config.check_scene().with_context(|| in_file(path))?;
         }
         if let Some(file) = config.simulator_file() {
+            ensure!(
+                config.sim == SimConfig::default(),
+                "{}: [sim] and source.path both describe the simulated rig; delete one of them",
+                path.display()
+            );
             config.sim = simulator_file::load(file)?;
         }
         Ok(config)
@@ -200,6 +200,7 @@ impl Config {
             "rig.name is '{}', it must be letters, digits, '-' and '_'",
             self.rig.name
         );
+        self.sim.validate().context("in [sim]")?;
         range("source.fps", self.source.fps, 0.1, 1000.0)?;
         self.source.validate()?;
         ensure!(
@@ -368,13 +369,17 @@ mod tests {
     }
 
     #[test]
-    fn a_table_of_the_simulated_rig_is_answered_with_its_new_place() {
-        for text in ["[rig]\n[sim]\nwidth = 64\n", "[rig]\n[sim.motion]\nkind = \"walk\"\n", "\n[[sim.sensors]]\n"] {
-            let error = format!("{:#}", Config::parse(text).unwrap_err());
-            assert!(error.starts_with("line 2: [sim] is no longer read"), "{error}");
-            assert!(error.contains("source.path") && error.contains("flyrig sim print"), "{error}");
-        }
-        // A key of another table with the name of a removed one is only unknown.
+    fn the_simulated_rig_may_be_a_table() {
+        let config = Config::parse("[sim]\nwidth = 64\n[sim.motion]\nkind = \"walk\"\n").unwrap();
+        assert_eq!(config.sim.width, 64);
+        let error = format!("{:#}", Config::parse("[rig]\n[sim]\nwidht = 64\n").unwrap_err());
+        assert!(error.contains("line 3") && error.ends_with("did you mean `width`?"), "{error}");
+        let error = format!("{:#}", Config::parse("[sim]\nwidth = 1\n").unwrap_err());
+        assert!(error.starts_with("in [sim]: width"), "{error}");
+    }
+
+    #[test]
+    fn a_key_of_another_table_with_the_name_of_a_removed_one_is_only_unknown() {
         let error = Config::parse("[sync]\nrest = 1\n").unwrap_err().to_string();
         assert!(error.contains("unknown field `rest`") && !error.contains("no longer"), "{error}");
     }

@@ -269,7 +269,7 @@ fn pass(
     let views = LiveViews::new(&OutputSettings::default());
     let mut live = LiveRig::new(session, intake, views, publisher).with_splats(false);
 
-    let limit = args.minutes.map(|minutes| Duration::from_secs_f64(minutes.max(0.0) * 60.0));
+    let limit = args.minutes.map(|minutes| flyrig_types::saturating_secs(minutes * 60.0));
     let total = limit.map_or(args.frames as u64, |limit| limit.as_secs());
     let bar = progress_bar(total, if limit.is_some() { "seconds" } else { "frames" });
     let score_every = if limit.is_some() { 50 } else { (args.frames as u64 / SCORED).max(1) };
@@ -281,7 +281,7 @@ fn pass(
         if done {
             break;
         }
-        let turn_time = Duration::from_secs_f64(pass.frames as f64 / 12.0);
+        let turn_time = flyrig_types::saturating_secs(pass.frames as f64 / 12.0);
         let Some(step) = live.step(Duration::from_secs(10), Some(turn_time))? else {
             if live.ended() {
                 break;

@@ -87,7 +87,9 @@ pub fn eval(args: &EvalArgs, gpu: &GpuContext) -> Result<()> {
     contact.retain(|row| !row.pictures.is_empty());
     let metrics = evaluation.metrics(&replay, seconds);
     write_whole(&args.out.join("metrics.json"), &serde_json::to_vec_pretty(&metrics)?)?;
-    evaluation.report(&metrics, contact).save(&args.out.join("index.html"))?;
+    let mut report = evaluation.report(&metrics, contact);
+    report.facts.extend(replay.session.upright_fault().map(|fault| ("up".to_owned(), fault)));
+    report.save(&args.out.join("index.html"))?;
     print!("{}", evaluation.sheet.table());
     println!();
     print!("{}", replay.session.stages.table());

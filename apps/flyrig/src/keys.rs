@@ -51,6 +51,9 @@ pub enum KeysAction {
         /// Role: "viewer" watches, "cameras" sends camera images, "relay" watches and serves other viewers.
         #[arg(long, default_value = "viewer", value_parser = parse_role)]
         role: Role,
+        /// Camera that a key of role "cameras" may send; may be repeated. Every camera otherwise.
+        #[arg(long = "camera", value_name = "NAME")]
+        cameras: Vec<String>,
         #[command(flatten)]
         file: NewKeyArgs,
     },
@@ -102,15 +105,15 @@ pub fn keys(action: &KeysAction) -> Result<()> {
                 folder.display()
             );
         }
-        KeysAction::Add { name, role, file } => {
+        KeysAction::Add { name, role, cameras, file } => {
             let mut ring = open(&file.ring)?;
-            let path = new_file(file.out.as_deref(), name)?;
-            write(&ring.add(name, *role, file.days)?, &path)?;
+            let path = new_file(&mut ring, file.out.as_deref(), name)?;
+            report(&ring.add_file(&path, name, *role, cameras, file.days)?, &path);
         }
         KeysAction::Renew { name, file } => {
             let mut ring = open(&file.ring)?;
-            let path = new_file(file.out.as_deref(), name)?;
-            write(&ring.renew(name, file.days)?, &path)?;
+            let path = new_file(&mut ring, file.out.as_deref(), name)?;
+            report(&ring.renew_file(&path, name, file.days)?, &path);
             eprintln!("keys: the old key of '{name}' is refused from now on");
         }
         KeysAction::Revoke { name, ring } => {
@@ -118,9 +121,12 @@ pub fn keys(action: &KeysAction) -> Result<()> {
             eprintln!("keys: '{name}' is refused from now on, and disconnected if it is connected");
         }
         KeysAction::List { ring } => {
-            let ring = open(ring)?;
+            let mut ring = open(ring)?;
+            if let Err(error) = ring.refresh() {
+                tracing::debug!(%error, "the list is shown as it is");
+            }
             println!("rig '{}', reached at {}", ring.rig(), ring.hosts().join(", "));
-            println!("{:<24} {:<8} {:<21} state", "name", "role", "valid until");
+            println!("{:<24} {:<8} {:<16} {:<21} state", "name", "role", "cameras", "valid until");
             ring.holders().iter().for_each(|holder| println!("{}", line(holder)));
         }
     }
@@ -133,7 +139,13 @@ fn line(holder: &Holder) -> String {
         _ if holder.expires_at() <= std::time::SystemTime::now() => "expired",
         _ => "valid",
     };
-    format!("{:<24} {:<8} {:<21} {state}", holder.name, holder.role.name(), holder.expires)
+    let cameras = match holder {
+        Holder { revoked: true, .. } => "-".to_owned(),
+        _ if holder.role != Role::Cameras => "-".to_owned(),
+        _ if holder.cameras.is_empty() => "all".to_owned(),
+        _ => holder.cameras.join(","),
+    };
+    format!("{:<24} {:<8} {cameras:<16} {:<21} {state}", holder.name, holder.role.name(), holder.expires)
 }
 
 /// Opens the named key ring, or the only one in this folder.
@@ -160,8 +172,9 @@ fn open(RingArgs { ring }: &RingArgs) -> Result<Ring> {
     }
 }
 
-/// Refuses to overwrite a key, before anything is changed.
-fn new_file(out: Option<&Path>, name: &str) -> Result<PathBuf> {
+/// Returns the file of a new key, which must not exist; one that an ended command left there is removed.
+fn new_file(ring: &mut Ring, out: Option<&Path>, name: &str) -> Result<PathBuf> {
+    ring.refresh()?;
     let path = out.map_or_else(|| PathBuf::from(format!("{name}.key")), Path::to_owned);
     anyhow::ensure!(
         !path.exists(),
@@ -171,8 +184,8 @@ fn new_file(out: Option<&Path>, name: &str) -> Result<PathBuf> {
     Ok(path)
 }
 
-fn write(key: &KeyFile, path: &Path) -> Result<()> {
-    key.write_new(path)?;
+/// Prints where a new key is, and how it is used.
+fn report(key: &KeyFile, path: &Path) {
     println!("{}", path.display());
     let file = path.display();
     let with = match key.role {
@@ -184,5 +197,9 @@ fn write(key: &KeyFile, path: &Path) -> Result<()> {
         "keys: give {file} to '{}' over a channel you trust; it is used with `{with}` and valid until {}",
         key.holder, key.expires
     );
-    Ok(())
+    if key.role == Role::Cameras && key.cameras.is_empty() {
+        eprintln!(
+            "keys: it may send every camera; name those of its computer with --camera to let it send these alone"
+        );
+    }
 }

@@ -124,7 +124,7 @@ impl RigRecording {
 /// Runs `flyrig record`.
 pub fn record(config: &Config, args: &RecordArgs, gpu: Option<&GpuContext>) -> Result<()> {
     let stop = stop::flag();
-    let mut monitor = Monitor::start(&config.health.listen, false)?;
+    let mut monitor = Monitor::start(&config.health.listen, false)?.with_keys(&config.transport.keys);
     let take = open_recorded(config, gpu)?;
     let (pacing, rig) = (take.pacing(), take.calibration.map(|calibration| calibration.rig));
     let ids: Vec<CameraId> = take.sources.iter().map(|camera| camera.camera().clone()).collect();

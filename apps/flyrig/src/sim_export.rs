@@ -11,7 +11,7 @@ use flyrig_sim::{ExportOptions, SimConfig, Simulator, export};
 /// Arguments of `flyrig sim export`.
 #[derive(Debug, Args)]
 pub struct SimExportArgs {
-    /// Configuration of the simulated rig (TOML), as `flyrig sim print` prints it; its defaults otherwise.
+    /// Configuration of the simulated rig (TOML), as `flyrig sim print` prints it, or a rig's with a table [sim]; the defaults otherwise.
     pub config: Option<PathBuf>,
     /// New folder of the capture.
     #[arg(long)]

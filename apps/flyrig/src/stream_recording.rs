@@ -262,7 +262,7 @@ impl Player<'_> {
             return monotonic_nanos();
         }
         if wait > 0.0 {
-            std::thread::sleep(Duration::from_secs_f64(wait));
+            std::thread::sleep(flyrig_types::saturating_secs(wait));
         }
         own.saturating_add(ahead as i64)
     }

@@ -7,7 +7,7 @@ use std::{
     time::{Duration, Instant},
 };
 
-use anyhow::{Context, Result, bail, ensure};
+use anyhow::{Context, Result, ensure};
 use clap::Args;
 use flyrig_report::{arguments::parse_size, png, stop, write_whole};
 use flyrig_transport::{
@@ -16,13 +16,10 @@ use flyrig_transport::{
 };
 use flyrig_types::{Camera, Intrinsics, Isometry};
 use glam::DVec3;
-use opencv::{
-    core::{Mat, MatTraitConst as _, Size, Vec3b},
-    videoio::{VideoWriter, VideoWriterTrait as _, VideoWriterTraitConst as _},
-};
 use serde::{Deserialize, Serialize};
 
 use crate::arguments::{RigArgs, StopArgs};
+use crate::video_file::VideoFile;
 
 /// Arguments of `flyrig watch`.
 #[derive(Debug, Args)]
@@ -47,7 +44,7 @@ pub struct WatchArgs {
     /// Largest frame rate of the viewpoint of --eye; viewers share the rig's budget of pixels per second.
     #[arg(long, default_value_t = 30.0)]
     pub max_fps: f64,
-    /// Write every image as PNG into this folder, or a video if the name ends in .mp4 or .avi.
+    /// Write every image as PNG into this folder, or a video if the name ends in .mp4 or .avi; its images have their own times.
     #[arg(long)]
     pub out: Option<PathBuf>,
     /// Record the person stream into this MCAP file, for `flyrig play`, without receiving images.
@@ -74,8 +71,6 @@ fn parse_vec3(text: &str) -> Result<[f64; 3], String> {
 
 /// Interval between lines with rates.
 const PRINT_EVERY: Duration = Duration::from_secs(1);
-/// Nominal frame rate of a video, frames per second: images arrive irregularly, but a file needs one number.
-const VIDEO_FPS: f64 = 25.0;
 
 /// Statistics of `--stats`.
 #[derive(Debug, Default, Serialize, Deserialize)]
@@ -259,7 +254,7 @@ fn stats(subscriber: &Subscriber, received: u64, seconds: f64) -> WatchStats {
 /// Destination of the images.
 enum Sink {
     Folder(PathBuf),
-    Video { path: PathBuf, writer: Option<(VideoWriter, u32, u32)> },
+    Video { path: PathBuf, writer: Option<VideoFile> },
 }
 
 impl Sink {
@@ -290,26 +285,25 @@ impl Sink {
                 write_whole(&path, &png::encode_rgb(&rgb, width, height)?)
             }
             Self::Video { path, writer } => {
-                if writer.is_none() {
-                    *writer = Some((open_video(path, width, height)?, width, height));
-                }
-                let Some((writer, w, h)) = writer else { return Ok(()) };
-                if (*w, *h) != (width, height) {
+                let writer = match writer {
+                    Some(writer) => writer,
+                    None => writer.insert(VideoFile::create(path, (width, height))?),
+                };
+                let (w, h) = writer.size();
+                if (w, h) != (width, height) {
                     let text = format!("an image of {width}x{height} is left out of {}, of {w}x{h}", path.display());
                     complaints.add("images of another size", text);
                     return Ok(());
                 }
-                let bgr: Vec<Vec3b> = rgb.pixels().map(|p| Vec3b::from([p.0[2], p.0[1], p.0[0]])).collect();
-                let flat = Mat::from_slice(&bgr).context("handing an image to the video writer")?;
-                writer.write(&flat.reshape(3, height as i32)?).context("writing a video frame")?;
-                Ok(())
+                let failed = || format!("writing a video frame to {}", path.display());
+                writer.write(&rgb, picture.header.publisher, body.capture_nanos).with_context(failed)
             }
         }
     }
 
     fn finish(self) -> Result<()> {
-        if let Self::Video { path, writer: Some((mut writer, ..)) } = self {
-            writer.release().with_context(|| format!("closing {}", path.display()))?;
+        if let Self::Video { path, writer: Some(writer) } = self {
+            writer.finish().with_context(|| format!("closing {}", path.display()))?;
         }
         Ok(())
     }
@@ -329,17 +323,6 @@ fn decode(frame: &ViewFrame) -> Result<image::RgbImage> {
     let (found, stated) = (rgb.dimensions(), (frame.width, frame.height));
     ensure!(found == stated, "it is {}x{}, not {}x{}", found.0, found.1, stated.0, stated.1);
     Ok(rgb)
-}
-
-fn open_video(path: &Path, width: u32, height: u32) -> Result<VideoWriter> {
-    let is_avi = path.extension().is_some_and(|e| e.eq_ignore_ascii_case("avi"));
-    let code = if is_avi { VideoWriter::fourcc('M', 'J', 'P', 'G') } else { VideoWriter::fourcc('m', 'p', '4', 'v') }?;
-    let name = path.to_str().with_context(|| format!("{} is not a readable file name", path.display()))?;
-    let writer = VideoWriter::new(name, code, VIDEO_FPS, Size::new(width as i32, height as i32), true)?;
-    if !writer.is_opened()? {
-        bail!("cannot write a video to {}; does its folder exist?", path.display());
-    }
-    Ok(writer)
 }
 
 #[cfg(test)]
@@ -363,6 +346,7 @@ mod tests {
             frame: 7,
             capture_nanos: 0,
             publish_unix_nanos: 0,
+            publish_nanos: 0,
             host: 0,
             publisher: 0,
             width,

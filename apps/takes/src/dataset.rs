@@ -4,9 +4,9 @@ use std::path::{Path, PathBuf};
 
 use anyhow::{Context, Result, bail};
 use flyrig_calib::{CalibError, load_calibration};
-use flyrig_capture::{VideoOptions, VideoReplay, folder_image_size};
+use flyrig_capture::{VideoOptions, VideoReplay, folder_image_size, read_image};
 use flyrig_fusion::{Origin, PerceptionSettings};
-use flyrig_types::{Camera, CameraId, Image, PixelFormat, Rig, shortened};
+use flyrig_types::{Camera, CameraId, Image, Rig, shortened};
 
 /// Files of a calibration, of which at least one lies in a calibrated folder.
 const CALIBRATION_FILES: [&str; 3] = ["calibration.toml", "intri.yml", "extri.yml"];
@@ -125,8 +125,8 @@ fn load_plate(folder: &Path, camera: &Camera) -> Result<Option<Image>> {
     if !path.exists() {
         return Ok(None);
     }
-    let picture = image::open(&path).with_context(|| format!("cannot read {}", path.display()))?.into_rgb8();
-    let (width, height) = picture.dimensions();
+    let picture = read_image(&path)?;
+    let (width, height) = (picture.width(), picture.height());
     let expected = (camera.intrinsics.width, camera.intrinsics.height);
     if (width, height) != expected {
         bail!(
@@ -138,7 +138,7 @@ fn load_plate(folder: &Path, camera: &Camera) -> Result<Option<Image>> {
             expected.1
         );
     }
-    Ok(Some(Image::new(width, height, PixelFormat::Rgb8, picture.into_raw())?))
+    Ok(Some(picture))
 }
 
 /// Checks that masks can be computed: masks that are neither given nor come with an estimated pose need a plate of every camera, or a key

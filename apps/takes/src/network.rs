@@ -178,6 +178,10 @@ impl CameraSource for NetworkCamera {
 
 #[cfg(test)]
 mod tests {
+    use flyrig_capture::{CaptureThreads, ThreadsConfig};
+    use flyrig_transport::CameraPublisher;
+    use flyrig_types::{Camera, Image, Intrinsics, Isometry, PixelFormat};
+
     use super::*;
 
     #[test]
@@ -197,5 +201,46 @@ mod tests {
         assert_eq!(counts(&link(8, 3), &opened), (3, 1));
         assert_eq!(counts(&link(8, 1), &opened), (3, 1), "its computer has counted anew");
         assert_eq!(&*health_since(&link(8, 1), &opened).mode, "YUYV");
+    }
+
+    #[test]
+    fn a_camera_of_another_computer_at_half_rate_is_slow() {
+        let name = CameraId::from("far");
+        let listen = vec!["tcp/127.0.0.1:0".to_owned()];
+        let config = TransportConfig { listen, ..TransportConfig::publisher("slow") };
+        let host = CameraPublisher::open(&config, std::slice::from_ref(&name), host_clock()).unwrap();
+        let config = TransportConfig { connect: host.endpoints().to_vec(), ..TransportConfig::subscriber("slow") };
+        let camera = Camera {
+            time_offset_nanos: 0,
+            color: Default::default(),
+            id: name.clone(),
+            intrinsics: Intrinsics::pinhole(2, 1, 2.0),
+            camera_from_world: Isometry::IDENTITY,
+        };
+        let rig = Rig { cameras: vec![camera], world_up: glam::DVec3::Z };
+        let (openers, _) = openers(&config, &rig).unwrap();
+        let threads = CaptureThreads::start_opening(openers, ThreadsConfig::default()).unwrap();
+        let status = CameraStatus { mode: "GREY 2x1 at 30.00".to_owned(), ..CameraStatus::default() };
+        let (mut begun, mut sequence, mut count, end) = (None, 0u64, 0i64, Instant::now() + Duration::from_secs(60));
+        let rate = loop {
+            assert!(Instant::now() < end, "{:?}", threads.stats());
+            // At 15 per second by the camera's clock, and faster than that by ours: frames may be seconds old.
+            let first = *begun.get_or_insert_with(|| host_clock().now_nanos() - 6_000_000_000);
+            (sequence, count) = (sequence + 1, count + 1);
+            let capture_nanos = first + count * 66_666_667;
+            let image = Image::new(2, 1, PixelFormat::Gray8, vec![0; 2]).unwrap();
+            let camera = name.clone();
+            host.publish(Frame { camera, sequence, capture_nanos, exposure_nanos: None, image, mask: None }).unwrap();
+            host.publish_status(&name, &status).unwrap();
+            std::thread::sleep(Duration::from_millis(20));
+            if let Some(rate) = threads.stats()[0].rate {
+                break rate;
+            }
+            // The clock of the other computer was not known in time.
+            if capture_nanos > host_clock().now_nanos() {
+                (begun, count) = (None, 0);
+            }
+        };
+        assert!(rate.is_slow() && (rate.ratio() - 0.5).abs() < 0.01, "{rate:?}");
     }
 }

@@ -151,7 +151,7 @@ fn from_foreign(path: &Path, found: ForeignCameras) -> Result<RecordedCameras> {
         let color = Default::default();
         camera.intrinsics.map(|intrinsics| ImportedCamera { id, intrinsics, pose, time_offset_nanos: 0, color })
     };
-    let imported = Imported { cameras: cameras.iter().filter_map(imported).collect(), up };
+    let imported = Imported::new(cameras.iter().filter_map(imported).collect(), up);
     if lacks.is_some() {
         return Ok(RecordedCameras { ids, images, rig: None, lenses: imported.lenses(), lacks, notes });
     }

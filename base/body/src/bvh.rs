@@ -1,5 +1,6 @@
 //! BVH motion clips.
 
+use std::borrow::Cow;
 use std::path::{Path, PathBuf};
 
 use glam::{DQuat, DVec3};
@@ -84,15 +85,30 @@ impl BvhClip {
 pub fn load_bvh(path: impl AsRef<Path>) -> Result<BvhClip, BodyError> {
     let path = path.as_ref();
     let bytes = std::fs::read(path).map_err(|source| BodyError::Io { path: path.into(), source })?;
-    parse_bvh(&String::from_utf8_lossy(&bytes), path)
+    parse_bvh(&decode_text(&bytes), path)
 }
 
-/// Reads BVH text; `path` is for messages.
+/// Decodes UTF-8 or UTF-16 with a byte order mark, as editors on Windows write it; other bytes are taken as UTF-8.
+fn decode_text(bytes: &[u8]) -> String {
+    let wide = |rest: &[u8], unit: fn([u8; 2]) -> u16| {
+        String::from_utf16_lossy(&rest.as_chunks().0.iter().map(|pair| unit(*pair)).collect::<Vec<_>>())
+    };
+    match bytes {
+        [0xff, 0xfe, rest @ ..] => wide(rest, u16::from_le_bytes),
+        [0xfe, 0xff, rest @ ..] => wide(rest, u16::from_be_bytes),
+        _ => String::from_utf8_lossy(bytes).into_owned(),
+    }
+}
+
+/// Reads BVH text; `path` is for messages. A joint's name is the rest of its line, spaces included.
 ///
 /// # Errors
 /// [`BodyError::Bvh`] names the line.
 pub fn parse_bvh(text: &str, path: &Path) -> Result<BvhClip, BodyError> {
-    let mut words = Words { path, line: 0, rest: Vec::new().into_iter(), lines: text.lines() };
+    let text = text.trim_start_matches('\u{feff}');
+    // Old editors end lines by a carriage return alone.
+    let text = if text.contains('\n') { Cow::Borrowed(text) } else { Cow::Owned(text.replace('\r', "\n")) };
+    let mut words = Words { path, line: 0, rest: "", lines: text.lines() };
     words.expect("HIERARCHY")?;
     words.expect("ROOT")?;
     let mut joints = vec![joint(&mut words, None)?];
@@ -110,8 +126,9 @@ pub fn parse_bvh(text: &str, path: &Path) -> Result<BvhClip, BodyError> {
                 open.push(joints.len());
                 joints.push(child);
             }
-            "END" => {
-                words.expect("SITE")?;
+            "END" | "ENDSITE" => {
+                // "Site", or a name of another program.
+                words.rest = words.rest.find('{').map_or("", |brace| &words.rest[brace..]);
                 words.expect("{")?;
                 words.expect("OFFSET")?;
                 joints[current].end_site = Some(words.vector()?);
@@ -124,13 +141,13 @@ pub fn parse_bvh(text: &str, path: &Path) -> Result<BvhClip, BodyError> {
         }
     }
     words.expect("MOTION")?;
-    words.expect("FRAMES:")?;
+    words.label("FRAMES")?;
     let count = words.number()?;
     if !(count >= 1.0 && count <= MAX_FRAMES as f64 && count.fract() == 0.0) {
         return Err(words.fail(format!("{count} frames; a clip has 1 to {MAX_FRAMES}")));
     }
     words.expect("FRAME")?;
-    words.expect("TIME:")?;
+    words.label("TIME")?;
     let frame_secs = words.number()?;
     if !(1e-5..=10.0).contains(&frame_secs) {
         return Err(words.fail(format!("the frame time is {frame_secs} s; it must lie between 0.00001 and 10")));
@@ -143,11 +160,22 @@ pub fn parse_bvh(text: &str, path: &Path) -> Result<BvhClip, BodyError> {
     for _ in 0..count as usize {
         frames.push((0..width).map(|_| words.number()).collect::<Result<Vec<_>, _>>()?);
     }
+    // Lines of another width than the skeleton's would shift every number of the following frames.
+    let left = words.count_left();
+    if !left.is_multiple_of(width) {
+        return Err(words.fail(format!(
+            "{left} numbers are left after {count} frames of {width} channels; the lines do not fit the skeleton"
+        )));
+    }
+    if left > 0 {
+        let (file, more) = (path.display(), left / width);
+        tracing::warn!("{file}: {more} frames more than the {count} that its header names are left out");
+    }
     Ok(BvhClip { path: path.into(), joints, frame_secs, frames })
 }
 
 fn joint(words: &mut Words<'_>, parent: Option<usize>) -> Result<BvhJoint, BodyError> {
-    let name = words.next("a joint name")?.to_owned();
+    let name = words.name()?;
     words.expect("{")?;
     Ok(BvhJoint { name, parent, offset: DVec3::ZERO, channels: Vec::new(), end_site: None })
 }
@@ -174,22 +202,61 @@ fn channels(words: &mut Words<'_>) -> Result<Vec<BvhChannel>, BodyError> {
 struct Words<'a> {
     path: &'a Path,
     line: usize,
-    rest: std::vec::IntoIter<&'a str>,
+    /// Unread part of the current line.
+    rest: &'a str,
     lines: std::str::Lines<'a>,
 }
 
 impl<'a> Words<'a> {
-    fn next(&mut self, wanted: &str) -> Result<&'a str, BodyError> {
+    /// Moves to the next word.
+    fn seek(&mut self, wanted: &str) -> Result<(), BodyError> {
         loop {
-            if let Some(word) = self.rest.next() {
-                return Ok(word);
+            self.rest = self.rest.trim_start();
+            if !self.rest.is_empty() {
+                return Ok(());
             }
             let Some(line) = self.lines.next() else {
                 return Err(self.fail(format!("the file ends where {wanted} should stand; it is cut off")));
             };
             self.line += 1;
-            self.rest = line.split_whitespace().collect::<Vec<_>>().into_iter();
+            self.rest = line;
         }
+    }
+
+    fn next(&mut self, wanted: &str) -> Result<&'a str, BodyError> {
+        self.seek(wanted)?;
+        let (word, rest) = self.rest.split_at(self.rest.find(char::is_whitespace).unwrap_or(self.rest.len()));
+        self.rest = rest;
+        Ok(word)
+    }
+
+    /// Reads a name: the rest of the line, up to an opening brace.
+    fn name(&mut self) -> Result<String, BodyError> {
+        self.seek("a joint name")?;
+        let (name, rest) = self.rest.split_at(self.rest.find('{').unwrap_or(self.rest.len()));
+        self.rest = rest;
+        match name.trim_end() {
+            "" => Err(self.fail("a joint without a name".to_owned())),
+            name => Ok(name.to_owned()),
+        }
+    }
+
+    /// Reads a word and the colon behind it, with or without spaces around the colon.
+    fn label(&mut self, wanted: &str) -> Result<(), BodyError> {
+        self.seek(&format!("'{wanted}:'"))?;
+        match self.rest.split_at_checked(wanted.len()) {
+            Some((label, rest)) if label.eq_ignore_ascii_case(wanted) => {
+                self.rest = rest.trim_start().trim_start_matches(':');
+                Ok(())
+            }
+            _ => Err(self.fail(format!("'{}' where '{wanted}:' should stand", self.rest.trim_end()))),
+        }
+    }
+
+    /// Counts the words up to the end of the file.
+    fn count_left(&mut self) -> usize {
+        let rest = std::mem::take(&mut self.rest).split_whitespace().count();
+        rest + self.lines.by_ref().map(|line| line.split_whitespace().count()).sum::<usize>()
     }
 
     fn expect(&mut self, wanted: &str) -> Result<(), BodyError> {

@@ -15,6 +15,8 @@ const SPEED_NANOS: i64 = 50_000_000;
 const SHORTEST_NANOS: i64 = 70_000_000;
 /// Approximate time in which the hips are lowered and raised around frames whose legs need it, nanoseconds.
 const SOFT_NANOS: i64 = 120_000_000;
+/// Largest angle by which a foot is levelled, radians: beyond it a dancer stands on the toes.
+const TILT: f64 = 35.0 * std::f64::consts::PI / 180.0;
 /// Largest extension of a leg, as a fraction of its length.
 const STRETCH: f64 = 0.999;
 
@@ -126,26 +128,58 @@ fn radius(nanos: &[i64], time: i64) -> usize {
     (time / frame).clamp(1, 60) as usize
 }
 
+/// Turns each foot of z-up poses by one rotation, so that its sole is level on average while the source stands on heel and ball: rigs
+/// differ in the slope from ankle to toe. Toes keep their direction.
+pub(crate) fn level_feet(
+    skeleton: &Skeleton,
+    legs: &[[usize; 4]; 2],
+    nanos: &[i64],
+    source: &[FootSource; 2],
+    poses: &mut [Pose],
+) {
+    for ([_, _, ankle, toe], foot) in legs.iter().zip(source) {
+        let Some(toes) = &foot.toe else { continue };
+        let bind = skeleton.joints()[*ankle].bind_rotation();
+        let is_flat = still(nanos, &foot.ankle).into_iter().zip(still(nanos, toes)).map(|(heel, ball)| heel && ball);
+        let ups = poses.iter().zip(is_flat).filter(|(_, is_flat)| *is_flat).map(|(pose, _)| {
+            let world = DQuat::from_mat4(&skeleton.world_from_joint(pose)[*ankle]);
+            bind * world.inverse() * DVec3::Z
+        });
+        let Some(up) = ups.sum::<DVec3>().try_normalize().filter(|up| up.angle_between(DVec3::Y) < TILT) else {
+            continue;
+        };
+        let level = bind.inverse() * DQuat::from_rotation_arc(DVec3::Y, up) * bind;
+        for pose in &mut *poses {
+            pose.joint_rotations[*ankle] = (pose.joint_rotations[*ankle] * level).normalize();
+            if toe != ankle {
+                pose.joint_rotations[*toe] = (level.inverse() * pose.joint_rotations[*toe]).normalize();
+            }
+        }
+    }
+}
+
+/// Returns the frames in which a joint is low and slow.
+fn still(nanos: &[i64], places: &[DVec3]) -> Vec<bool> {
+    let mut heights: Vec<f64> = places.iter().map(|place| place.y).collect();
+    heights.sort_by(f64::total_cmp);
+    let floor = heights.get(heights.len() / 20).copied().unwrap_or(0.0);
+    let around = radius(nanos, SPEED_NANOS / 2);
+    let quiet = |i: usize| {
+        let (before, after) = (i.saturating_sub(around), (i + around).min(places.len() - 1));
+        let secs = (nanos[after] - nanos[before]) as f64 * 1e-9;
+        let speed = places[after].distance(places[before]) / secs.max(1e-9);
+        after > before && places[i].y - floor < LOW_M && speed < SLOW_M_A_SEC
+    };
+    let mut still: Vec<bool> = (0..places.len()).map(quiet).collect();
+    fill_short(&mut still, nanos, false);
+    fill_short(&mut still, nanos, true);
+    still
+}
+
 /// Classifies the contact in each frame.
 fn stands(nanos: &[i64], foot: &FootSource) -> Vec<Stand> {
-    let still = |places: &[DVec3]| -> Vec<bool> {
-        let mut heights: Vec<f64> = places.iter().map(|place| place.y).collect();
-        heights.sort_by(f64::total_cmp);
-        let floor = heights.get(heights.len() / 20).copied().unwrap_or(0.0);
-        let around = radius(nanos, SPEED_NANOS / 2);
-        let quiet = |i: usize| {
-            let (before, after) = (i.saturating_sub(around), (i + around).min(places.len() - 1));
-            let secs = (nanos[after] - nanos[before]) as f64 * 1e-9;
-            let speed = places[after].distance(places[before]) / secs.max(1e-9);
-            after > before && places[i].y - floor < LOW_M && speed < SLOW_M_A_SEC
-        };
-        let mut still: Vec<bool> = (0..places.len()).map(quiet).collect();
-        fill_short(&mut still, nanos, false);
-        fill_short(&mut still, nanos, true);
-        still
-    };
-    let heel = still(&foot.ankle);
-    let ball = foot.toe.as_ref().map_or_else(|| heel.clone(), |toe| still(toe));
+    let heel = still(nanos, &foot.ankle);
+    let ball = foot.toe.as_ref().map_or_else(|| heel.clone(), |toe| still(nanos, toe));
     let stand = |(heel, ball): (&bool, &bool)| match (heel, ball) {
         (_, true) => Stand::Ball,
         (true, false) => Stand::Heel,

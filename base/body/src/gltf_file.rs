@@ -1,14 +1,15 @@
 //! Buffers and accessors of glTF files, with all lengths checked.
 
+use std::borrow::Cow;
 use std::path::{Path, PathBuf};
 
 use base64::Engine;
+use gltf::accessor::sparse::IndexType;
 use gltf::accessor::{DataType, Dimensions};
 use gltf::buffer::Source;
-use gltf::json::validation::Checked;
 
 use crate::gltf_limits::{MAX_FILE_BYTES, MAX_JSON_ENTRIES};
-use crate::{BodyError, gltf_uri};
+use crate::{BodyError, gltf_json, gltf_uri};
 
 /// Parsed file with its buffers.
 pub(crate) struct GltfFile<'a> {
@@ -35,8 +36,14 @@ impl<'a> GltfFile<'a> {
             return Err(fail(too_many("entries of the JSON part", entries, MAX_JSON_ENTRIES)));
         }
         let invalid = |error: gltf::Error| fail(format!("not a valid glTF 2.0 file: {error}"));
-        let gltf::Gltf { document, mut blob } = gltf::Gltf::from_slice_without_validation(&bytes).map_err(invalid)?;
-        let json = document.into_json();
+        let (text, mut blob) = match bytes.starts_with(b"glTF") {
+            true => {
+                let glb = gltf::Glb::from_slice(&bytes).map_err(invalid)?;
+                (glb.json, glb.bin.map(Cow::into_owned))
+            }
+            false => (bytes.as_slice().into(), None),
+        };
+        let json = gltf_json::read(&text, path).map_err(fail)?;
         check_trusted(&json).map_err(fail)?;
         let document = gltf::Document::from_json(json).map_err(invalid)?;
         let beside = external_buffers(path, &document)?;
@@ -44,7 +51,7 @@ impl<'a> GltfFile<'a> {
         for (buffer, beside) in document.buffers().zip(beside) {
             let index = buffer.index();
             let data = match (buffer.source(), beside) {
-                (Source::Bin, _) => blob.take().ok_or_else(|| fail("the binary chunk is missing".to_owned()))?,
+                (Source::Bin, _) => blob.take().ok_or_else(|| fail(format!("buffer {index} has no data")))?,
                 (Source::Uri(_), Some(beside)) => gltf_uri::read(&beside, MAX_FILE_BYTES)?,
                 (Source::Uri(uri), None) => base64::engine::general_purpose::STANDARD
                     .decode(embedded(uri).unwrap_or_default())
@@ -87,20 +94,54 @@ impl<'a> GltfFile<'a> {
         if found != wanted {
             return Err(self.fail(format!("{what} is {found:?}, it must be {wanted:?}")));
         }
-        if accessor.sparse().is_some() {
-            return Err(self.fail(format!("{what} is stored sparsely; export the file without sparse accessors")));
-        }
         let count = accessor.count();
         self.check_count(&format!("items of {what}"), count, limit)?;
-        let Some(view) = accessor.view() else { return Err(self.fail(format!("{what} has no data"))) };
         let data_type = accessor.data_type();
+        let item = |bytes: &[u8]| {
+            let size = data_type.size();
+            std::array::from_fn(|n| number(&bytes[n * size..(n + 1) * size], data_type, accessor.normalized()))
+        };
         let size = data_type.size() * N;
-        let stride = view.stride().unwrap_or(size);
+        let mut items: Vec<[f64; N]> = match accessor.view() {
+            Some(view) => self.rows(&view, accessor.offset(), size, count, what)?.map(item).collect(),
+            // Zeros by the specification.
+            None => vec![[0.0; N]; count],
+        };
+        if let Some(sparse) = accessor.sparse() {
+            let changed = sparse.count();
+            self.check_count(&format!("replaced items of {what}"), changed, count)?;
+            let (indices, values) = (sparse.indices(), sparse.values());
+            let index_type = match indices.index_type() {
+                IndexType::U8 => DataType::U8,
+                IndexType::U16 => DataType::U16,
+                IndexType::U32 => DataType::U32,
+            };
+            let at = self.rows(&indices.view(), indices.offset(), index_type.size(), changed, what)?;
+            for (at, value) in at.zip(self.rows(&values.view(), values.offset(), size, changed, what)?) {
+                let at = number(at, index_type, false) as usize;
+                let Some(replaced) = items.get_mut(at) else {
+                    return Err(self.fail(format!("{what} replaces item {at} of {count}; the file is damaged")));
+                };
+                *replaced = item(value);
+            }
+        }
+        Ok(items)
+    }
+
+    /// Returns `count` rows of `size` bytes of a view, from `offset` on, with all lengths checked.
+    fn rows<'s>(
+        &'s self,
+        view: &gltf::buffer::View<'_>,
+        offset: usize,
+        size: usize,
+        count: usize,
+        what: &str,
+    ) -> Result<impl Iterator<Item = &'s [u8]> + use<'s, 'a>, BodyError> {
         let cut_off = || self.fail(format!("{what} reaches beyond the end of its buffer; the file is damaged"));
+        let stride = view.stride().unwrap_or(size);
         let buffer = self.buffers.get(view.buffer().index()).ok_or_else(cut_off)?;
         let end = view.offset().checked_add(view.length()).ok_or_else(cut_off)?;
-        let bytes = buffer.get(view.offset()..end).ok_or_else(cut_off)?;
-        let bytes = bytes.get(accessor.offset()..).ok_or_else(cut_off)?;
+        let bytes = buffer.get(view.offset()..end).and_then(|bytes| bytes.get(offset..)).ok_or_else(cut_off)?;
         let needed = match count {
             0 => Some(0),
             _ => stride.checked_mul(count - 1).and_then(|bytes| bytes.checked_add(size)),
@@ -108,13 +149,7 @@ impl<'a> GltfFile<'a> {
         if stride < size || needed.is_none_or(|needed| needed > bytes.len()) {
             return Err(cut_off());
         }
-        let item = |index: usize| {
-            std::array::from_fn(|n| {
-                let at = index * stride + n * data_type.size();
-                number(&bytes[at..at + data_type.size()], data_type, accessor.normalized())
-            })
-        };
-        Ok((0..count).map(item).collect())
+        Ok((0..count).map(move |index| &bytes[index * stride..index * stride + size]))
     }
 
     /// Reads numbers as [`Self::numbers`] does and checks that all are finite.
@@ -197,8 +232,8 @@ fn check_trusted(json: &gltf::json::Root) -> Result<(), String> {
         return Err("a mesh names an accessor that does not exist; the file is damaged".to_owned());
     }
     for target in json.animations.iter().flat_map(|animation| &animation.channels).map(|channel| &channel.target) {
-        if target.node.value() >= json.nodes.len() || target.path == Checked::Invalid {
-            return Err("an animation moves a node or a property that does not exist; the file is damaged".to_owned());
+        if target.node.value() >= json.nodes.len() {
+            return Err("an animation moves a node that does not exist; the file is damaged".to_owned());
         }
     }
     Ok(())

@@ -3,11 +3,12 @@
 use std::path::Path;
 
 use flyrig_types::{Pose, PoseTrack};
-use glam::{DMat3, DMat4, DVec3, Vec2, Vec3};
+use glam::{DMat3, DMat4, DVec3};
 
 use crate::gltf_file::GltfFile;
-use crate::gltf_limits::{MAX_INDICES, MAX_JOINT_SETS, MAX_JOINTS, MAX_VERTICES};
+use crate::gltf_mesh::{Mesh, read_meshes};
 use crate::gltf_nodes::{Nodes, Placement};
+use crate::gltf_skins::BodySkins;
 use crate::part::part_of_joints;
 use crate::{BodyError, Joint, Skeleton, SkinWeights, Template};
 
@@ -16,11 +17,12 @@ use crate::{BodyError, Joint, Skeleton, SkinWeights, Template};
 pub struct GltfHuman {
     /// Body; its skeleton rests in the file's node transforms.
     pub template: Template,
-    /// First animation, in the file's world (y up), metres.
+    /// First animation that moves, in the file's world (y up), metres.
     pub track: Option<PoseTrack>,
 }
 
-/// Reads the first skin of a `.glb` or `.gltf` file with all triangle meshes attached to it, and the first animation.
+/// Reads the body of a `.glb` or `.gltf` file, all triangle meshes on the skins that share its joints, and the first animation
+/// that moves it (the first that concerns it where all stand still).
 ///
 /// Influences of a vertex are reduced to the strongest four. Transforms above the root joint, even
 /// scale included, are folded into the root; a leading joint that moves nothing but its only child is folded
@@ -36,24 +38,8 @@ pub struct GltfHuman {
 pub fn load_gltf(path: &Path) -> Result<GltfHuman, BodyError> {
     let file = GltfFile::open(path)?;
     let nodes = Nodes::new(&file)?;
-    let Some(skin) = file.document.skins().next() else {
-        return Err(file.fail("no skin; export the body with its armature"));
-    };
-    file.check_count("joints of the skin", skin.joints().count(), MAX_JOINTS)?;
-    let mut mesh = read_meshes(&file, &skin)?;
-    let mut joint_nodes: Vec<usize> = skin.joints().map(|node| node.index()).collect();
-    if let Some(joint) = mesh.skin.iter().flat_map(|s| s.joints).find(|&joint| usize::from(joint) >= joint_nodes.len())
-    {
-        return Err(file.fail(format!("a vertex names joint {joint} of {}", joint_nodes.len())));
-    }
-    let mut inverse_binds = vec![DMat4::IDENTITY; joint_nodes.len()];
-    if let Some(accessor) = skin.inverse_bind_matrices() {
-        let matrices = file.finite::<16>(&accessor, "the inverse bind matrices", MAX_JOINTS)?;
-        if matrices.len() < joint_nodes.len() {
-            return Err(file.fail("there are fewer inverse bind matrices than joints"));
-        }
-        inverse_binds = matrices[..joint_nodes.len()].iter().map(DMat4::from_cols_array).collect();
-    }
+    let BodySkins { mut joint_nodes, mut inverse_binds, skins } = BodySkins::new(&file, &nodes)?;
+    let mut mesh = read_meshes(&file, &skins)?;
     let new_from_old = order_joints(&file, &nodes, &mesh.skin, &mut joint_nodes, &mut inverse_binds)?;
     for skin in &mut mesh.skin {
         for (joint, weight) in skin.joints.iter_mut().zip(skin.weights) {
@@ -62,7 +48,8 @@ pub fn load_gltf(path: &Path) -> Result<GltfHuman, BodyError> {
     }
 
     let rest = placements(&file, &nodes.rest(), &joint_nodes)?;
-    let canonical_from_mesh = canonical_from_mesh(&file, &rest[0], &inverse_binds[0])?;
+    even_out(&mut mesh, &rest[0], &mut inverse_binds);
+    let canonical_from_mesh = canonical_from_mesh(&file, &rest[0], &inverse_binds[0], &mesh)?;
     for (position, normal) in mesh.positions.iter_mut().zip(&mut mesh.normals) {
         *position = canonical_from_mesh.transform_point3(position.as_dvec3()).as_vec3();
         *normal = canonical_from_mesh.transform_vector3(normal.as_dvec3()).as_vec3().normalize_or_zero();
@@ -70,8 +57,14 @@ pub fn load_gltf(path: &Path) -> Result<GltfHuman, BodyError> {
     let mesh_from_canonical = canonical_from_mesh.inverse();
     let parents = joint_parents(&nodes, &joint_nodes);
     let pose = pose_of(&rest, &parents);
-    let joints = joint_nodes.iter().enumerate().map(|(index, &node)| Joint {
-        name: joint_name(&file, node),
+    let mut names: Vec<String> = joint_nodes.iter().map(|&node| joint_name(&file, node)).collect();
+    for index in 1..names.len() {
+        if names[..index].contains(&names[index]) {
+            names[index] = format!("{} (node {})", names[index], joint_nodes[index]);
+        }
+    }
+    let joints = joint_nodes.iter().enumerate().map(|(index, _)| Joint {
+        name: names[index].clone(),
         parent: parents[index],
         rest_translation: match parents[index] {
             None => rest[index].translation,
@@ -101,7 +94,7 @@ pub fn load_gltf(path: &Path) -> Result<GltfHuman, BodyError> {
     Ok(GltfHuman { template: Template { name, positions, normals, uvs, triangles, skin, parts, skeleton }, track })
 }
 
-fn joint_name(file: &GltfFile<'_>, node: usize) -> String {
+pub(crate) fn joint_name(file: &GltfFile<'_>, node: usize) -> String {
     let name = file.document.nodes().nth(node).and_then(|node| node.name().map(str::to_owned));
     name.unwrap_or_else(|| format!("node {node}"))
 }
@@ -158,7 +151,7 @@ fn order_joints(
 }
 
 /// Returns the nearest ancestor of each joint that is itself a joint.
-fn joint_parents(nodes: &Nodes, joint_nodes: &[usize]) -> Vec<Option<usize>> {
+pub(crate) fn joint_parents(nodes: &Nodes, joint_nodes: &[usize]) -> Vec<Option<usize>> {
     let mut joint_at = vec![None; nodes.parents.len()];
     for (joint, &node) in joint_nodes.iter().enumerate().rev() {
         joint_at[node] = Some(joint);
@@ -194,20 +187,48 @@ fn pose_of(placements: &[Placement], parents: &[Option<usize>]) -> Pose {
     }
 }
 
+/// Scales a mesh whose axes have different steps (KHR_mesh_quantization allows it) so that it has one.
+fn even_out(mesh: &mut Mesh, root: &Placement, inverse_binds: &mut [DMat4]) {
+    let linear = DMat3::from_quat(root.rotation) * DMat3::from_mat4(inverse_binds[0]);
+    let steps = DVec3::new(linear.x_axis.length(), linear.y_axis.length(), linear.z_axis.length());
+    let stretch = steps / steps.x;
+    if !(stretch.is_finite() && stretch.min_element() > 1e-6) || stretch.abs_diff_eq(DVec3::ONE, 0.01) {
+        return;
+    }
+    for (position, normal) in mesh.positions.iter_mut().zip(&mut mesh.normals) {
+        *position = (position.as_dvec3() * stretch).as_vec3();
+        *normal = (normal.as_dvec3() / stretch).as_vec3();
+    }
+    inverse_binds.iter_mut().for_each(|matrix| *matrix *= DMat4::from_scale(stretch.recip()));
+}
+
 /// Returns the scale to metres and the quarter turns that bring the bind pose upright, for meshes stored along other axes than
 /// the world's.
-fn canonical_from_mesh(file: &GltfFile<'_>, root: &Placement, inverse_bind: &DMat4) -> Result<DMat4, BodyError> {
+fn canonical_from_mesh(
+    file: &GltfFile<'_>,
+    root: &Placement,
+    inverse_bind: &DMat4,
+    mesh: &Mesh,
+) -> Result<DMat4, BodyError> {
     let world_from_root = DMat4::from_rotation_translation(root.rotation, root.translation);
     let world_from_mesh = world_from_root * DMat4::from_scale(DVec3::splat(root.scale)) * *inverse_bind;
-    let Some(Placement { rotation, scale, .. }) = Placement::from_matrix(&world_from_mesh) else {
+    let Some(Placement { rotation, scale, translation }) = Placement::from_matrix(&world_from_mesh) else {
         return Err(file.fail("the root's inverse bind matrix is sheared, mirrored or scaled unevenly"));
     };
     let up_in_mesh = rotation.inverse() * DVec3::Y;
     let front_in_mesh = rotation.inverse() * DVec3::Z;
     let y = nearest_axis(up_in_mesh);
     let z = nearest_axis(front_in_mesh - y * y.dot(front_in_mesh));
-    let canonical_from_mesh = DMat3::from_cols(y.cross(z), y, z).transpose();
-    Ok(DMat4::from_mat3(canonical_from_mesh * scale))
+    let turn = DMat3::from_cols(y.cross(z), y, z).transpose();
+    let turned = DMat4::from_mat3(turn * scale);
+    // Quantised meshes have their middle at the origin and their place in the inverse bind matrices; others rest where
+    // their nodes stand. The body stands on the floor.
+    let lowest = |above: f64| {
+        let heights = mesh.positions.iter().map(|p| turned.transform_point3(p.as_dvec3()).y + above);
+        heights.fold(f64::INFINITY, f64::min).abs()
+    };
+    let moved = turn * (rotation.inverse() * translation);
+    Ok(if lowest(moved.y) + 1e-6 < lowest(0.0) { DMat4::from_translation(moved) * turned } else { turned })
 }
 
 fn nearest_axis(v: DVec3) -> DVec3 {
@@ -219,141 +240,4 @@ fn nearest_axis(v: DVec3) -> DVec3 {
     } else {
         DVec3::Z * v.z.signum()
     }
-}
-
-#[derive(Default)]
-struct Mesh {
-    positions: Vec<Vec3>,
-    normals: Vec<Vec3>,
-    uvs: Vec<Vec2>,
-    triangles: Vec<[u32; 3]>,
-    /// Influences with the joint numbers of the file's skin.
-    skin: Vec<SkinWeights>,
-}
-
-/// Merges all triangle primitives of nodes with this skin.
-fn read_meshes(file: &GltfFile<'_>, skin: &gltf::Skin<'_>) -> Result<Mesh, BodyError> {
-    let mut mesh = Mesh::default();
-    let uses = |node: &gltf::Node<'_>| node.skin().is_some_and(|s| s.index() == skin.index());
-    let others = file.document.nodes().filter(|node| node.mesh().is_some() && !uses(node)).count();
-    if others > 0 {
-        tracing::warn!(path = %file.path.display(), others, "meshes without the first skin are left out");
-    }
-    check_sizes(file, file.document.nodes().filter(uses))?;
-    for node in file.document.nodes().filter(uses) {
-        let Some(source) = node.mesh() else { continue };
-        for primitive in source.primitives() {
-            let what = format!("primitive {} of mesh {}", primitive.index(), source.index());
-            if primitive.mode() != gltf::mesh::Mode::Triangles {
-                return Err(file.fail(format!("{what} is drawn as {:?}; export triangles", primitive.mode())));
-            }
-            read_primitive(file, &primitive, &what, &mut mesh)?;
-        }
-    }
-    if mesh.triangles.is_empty() {
-        return Err(file.fail("no mesh with triangles hangs on the skin"));
-    }
-    Ok(mesh)
-}
-
-/// Checks the total sizes of all meshes before anything is read: primitives may share data, and nodes a mesh.
-fn check_sizes<'a>(file: &GltfFile<'_>, nodes: impl Iterator<Item = gltf::Node<'a>>) -> Result<(), BodyError> {
-    let (mut vertices, mut corners) = (0usize, 0usize);
-    for mesh in nodes.filter_map(|node| node.mesh()) {
-        for primitive in mesh.primitives() {
-            let what = |items: &str| format!("{items} up to primitive {} of mesh {}", primitive.index(), mesh.index());
-            let count = primitive.get(&gltf::Semantic::Positions).map_or(0, |accessor| accessor.count());
-            // An empty primitive counts too, so that this loop is bounded.
-            vertices = vertices.saturating_add(count.max(1));
-            corners = corners.saturating_add(primitive.indices().map_or(count, |accessor| accessor.count()));
-            file.check_count(&what("vertices"), vertices, MAX_VERTICES)?;
-            file.check_count(&what("triangle corners"), corners, MAX_INDICES)?;
-        }
-    }
-    Ok(())
-}
-
-fn read_primitive(
-    file: &GltfFile<'_>,
-    primitive: &gltf::Primitive<'_>,
-    what: &str,
-    mesh: &mut Mesh,
-) -> Result<(), BodyError> {
-    use gltf::Semantic::{Joints, Normals, Positions, TexCoords, Weights};
-    let first = mesh.positions.len();
-    let missing = |name: &str| file.fail(format!("{what} has no {name}"));
-    let check = |found: usize, expected: usize, name: &str| match found == expected {
-        true => Ok(()),
-        false => Err(file.fail(format!("{what} has {found} {name} for {expected} vertices"))),
-    };
-    let positions = primitive.get(&Positions).ok_or_else(|| missing("positions"))?;
-    let positions = file.finite::<3>(&positions, &format!("the positions of {what}"), MAX_VERTICES)?;
-    let count = positions.len();
-    mesh.positions.extend(positions.iter().map(|&p| DVec3::from_array(p).as_vec3()));
-
-    let indices: Vec<usize> = match primitive.indices() {
-        Some(accessor) => {
-            let indices = file.numbers::<1>(&accessor, &format!("the indices of {what}"), MAX_INDICES)?;
-            indices.iter().map(|[i]| *i as usize).collect()
-        }
-        None => (0..count).collect(),
-    };
-    if let Some(index) = indices.iter().find(|&&index| index >= count) {
-        return Err(file.fail(format!("{what} has index {index} but {count} vertices")));
-    }
-    let (triangles, _) = indices.as_chunks::<3>();
-    mesh.triangles.extend(triangles.iter().map(|t| t.map(|index| (first + index) as u32)));
-
-    match primitive.get(&Normals) {
-        Some(accessor) => {
-            let normals = file.finite::<3>(&accessor, &format!("the normals of {what}"), MAX_VERTICES)?;
-            check(normals.len(), count, "normals")?;
-            mesh.normals.extend(normals.iter().map(|&n| DVec3::from_array(n).as_vec3()));
-        }
-        None => {
-            let mut normals = vec![Vec3::ZERO; count];
-            for t in triangles {
-                let [a, b, c] = t.map(|index| mesh.positions[first + index]);
-                for &index in t {
-                    normals[index] += (b - a).cross(c - a);
-                }
-            }
-            mesh.normals.extend(normals);
-        }
-    }
-    match primitive.get(&TexCoords(0)) {
-        Some(accessor) => {
-            let uvs = file.finite::<2>(&accessor, &format!("the texture coordinates of {what}"), MAX_VERTICES)?;
-            check(uvs.len(), count, "texture coordinates")?;
-            mesh.uvs.extend(uvs.iter().map(|&[u, v]| Vec2::new(u as f32, v as f32)));
-        }
-        None => mesh.uvs.resize(first + count, Vec2::ZERO),
-    }
-
-    let mut influences = vec![Vec::new(); count];
-    for set in 0.. {
-        let (Some(joints), Some(weights)) = (primitive.get(&Joints(set)), primitive.get(&Weights(set))) else { break };
-        file.check_count(&format!("sets of joints of {what}"), set as usize + 1, MAX_JOINT_SETS as usize)?;
-        let joints = file.finite::<4>(&joints, &format!("the joints of {what}"), MAX_VERTICES)?;
-        let weights = file.finite::<4>(&weights, &format!("the weights of {what}"), MAX_VERTICES)?;
-        check(joints.len(), count, "joint sets")?;
-        check(weights.len(), count, "weight sets")?;
-        for ((list, joints), weights) in influences.iter_mut().zip(&joints).zip(&weights) {
-            list.extend(joints.iter().map(|&joint| joint as u16).zip(weights.iter().map(|&w| w as f32)));
-        }
-    }
-    let mut loose = 0;
-    for list in influences {
-        mesh.skin.push(SkinWeights::strongest(&list).unwrap_or_else(|| {
-            loose += 1;
-            SkinWeights { joints: [0; 4], weights: [1.0, 0.0, 0.0, 0.0] }
-        }));
-    }
-    if loose == count {
-        return Err(file.fail(format!("{what} has no skin weights; export the body with its armature")));
-    }
-    if loose > 0 {
-        tracing::warn!(path = %file.path.display(), loose, "vertices without weights follow the first joint");
-    }
-    Ok(())
 }

@@ -11,7 +11,10 @@ pub(crate) const MAX_JSON_ENTRIES: usize = 1 << 20;
 /// Nodes of the document: a whole scene around a person has some thousands.
 pub(crate) const MAX_NODES: usize = 1 << 14;
 
-/// Joints of the skin: bodies with face and fingers have some hundreds.
+/// Skins of the document: an avatar has up to some tens, a crowd some hundreds.
+pub(crate) const MAX_SKINS: usize = 1 << 10;
+
+/// Joints of a skin, and of all skins of a body: bodies with face and fingers have some hundreds.
 pub(crate) const MAX_JOINTS: usize = 1 << 10;
 
 /// Vertices of all meshes on the skin, repeated ones counted again: scans have up to a million. A vertex takes some 300

@@ -5,10 +5,18 @@ use gltf::animation::{Interpolation, Property};
 
 use crate::BodyError;
 use crate::gltf_file::GltfFile;
+use crate::gltf_json::shown;
 use crate::gltf_limits::{MAX_ANIMATION_KEYS, MAX_KEY_SECS, MAX_NODES, MAX_POSED_NODES};
 
 /// Interval of poses between two keys of a cubic curve, nanoseconds.
 const CUBIC_STEP_NANOS: i64 = 1_000_000_000 / 120;
+
+/// Least rotation of a joint, radians, and least way as a part of the longest bone by which an animation moves.
+const MOVES_RAD: f64 = 0.05;
+const MOVES_PART: f64 = 0.02;
+
+/// Animations that a message names.
+const SHOWN: usize = 8;
 
 /// Transform of a node in its parent: translation, rotation, scale.
 #[derive(Debug, Clone, Copy)]
@@ -104,7 +112,7 @@ impl Nodes {
     }
 
     /// Calls `pose` with the time in nanoseconds and `world_from_node` of the joints and the nodes above them, for each
-    /// key of the first animation in order of time; not at all without an animation that moves a joint. Matrices of other nodes
+    /// key of the chosen animation in order of time; not at all without an animation that concerns a joint. Matrices of other nodes
     /// have no meaning.
     pub fn animate(
         &self,
@@ -113,7 +121,7 @@ impl Nodes {
         mut pose: impl FnMut(i64, &[DMat4]) -> Result<(), BodyError>,
     ) -> Result<(), BodyError> {
         let moving = self.moving(joint_nodes);
-        let curves = self.curves(file, &moving)?;
+        let curves = self.choose(file, &moving)?;
         let (mut locals, mut world) = (self.locals.clone(), vec![DMat4::IDENTITY; self.locals.len()]);
         for at in pose_times(file, &curves, moving.len())? {
             for curve in &curves {
@@ -131,16 +139,56 @@ impl Nodes {
         Ok(())
     }
 
-    /// Reads the channels of the first animation that move one of these nodes.
-    fn curves(&self, file: &GltfFile<'_>, moving: &[usize]) -> Result<Vec<Curve>, BodyError> {
-        let Some(animation) = file.document.animations().next() else { return Ok(Vec::new()) };
+    /// Returns the first animation that moves these nodes, or else the first that concerns them. Says which, where there are several.
+    fn choose(&self, file: &GltfFile<'_>, moving: &[usize]) -> Result<Vec<Curve>, BodyError> {
+        let size = moving.iter().map(|&node| self.locals[node].translation.length()).fold(0.0, f64::max);
+        let mut keys = 0usize;
+        let mut still: Option<(usize, Vec<Curve>)> = None;
+        let mut chosen = None;
+        for animation in file.document.animations() {
+            // Many animations may share their keys; those that are looked at stay within the limit of one.
+            if keys > 0 && keys.saturating_add(count_keys(&animation)) > MAX_ANIMATION_KEYS {
+                break;
+            }
+            let curves = self.curves(file, &animation, moving, &mut keys)?;
+            if curves.iter().any(|curve| curve.moves(size)) {
+                chosen = Some((animation.index(), curves));
+                break;
+            }
+            still = still.or((!curves.is_empty()).then(|| (animation.index(), curves)));
+        }
+        let Some((index, curves)) = chosen.or(still) else { return Ok(Vec::new()) };
+        let names: Vec<String> =
+            file.document.animations().take(SHOWN).map(|animation| animation_name(&animation)).collect();
+        let count = file.document.animations().count();
+        if count > 1 {
+            let name =
+                file.document.animations().nth(index).map(|animation| animation_name(&animation)).unwrap_or_default();
+            tracing::info!(
+                "{}: animation {name} is taken, number {} of {count} ({}{}), the first that moves the body",
+                file.path.display(),
+                index + 1,
+                names.join(", "),
+                if count > names.len() { ", ..." } else { "" }
+            );
+        }
+        Ok(curves)
+    }
+
+    /// Reads the channels of an animation that move one of these nodes, and adds the number of their keys to `keys`.
+    fn curves(
+        &self,
+        file: &GltfFile<'_>,
+        animation: &gltf::Animation<'_>,
+        moving: &[usize],
+        keys: &mut usize,
+    ) -> Result<Vec<Curve>, BodyError> {
         let mut is_free: Vec<Option<[bool; 3]>> = vec![None; self.parents.len()];
         for &node in moving {
             is_free[node] = Some([true; 3]);
         }
         // Everything is counted before it is read.
         let mut channels = Vec::new();
-        let mut keys = 0usize;
         for channel in animation.channels() {
             let what = format!("animation channel {}", channel.index());
             let node = channel.target().node().index();
@@ -155,8 +203,8 @@ impl Nodes {
             if !std::mem::take(&mut is_free[slot]) {
                 return Err(file.fail(format!("{what} moves the same property of node {node} as another one")));
             }
-            keys = keys.saturating_add(channel.sampler().input().count());
-            file.check_count(&format!("keys up to {what}"), keys, MAX_ANIMATION_KEYS)?;
+            *keys = keys.saturating_add(channel.sampler().input().count());
+            file.check_count(&format!("keys up to {what}"), *keys, MAX_ANIMATION_KEYS)?;
             channels.push((channel, node, what));
         }
         let curve = |(channel, node, what): (gltf::animation::Channel<'_>, usize, String)| {
@@ -183,6 +231,14 @@ impl Nodes {
         };
         channels.into_iter().map(curve).collect()
     }
+}
+
+fn count_keys(animation: &gltf::Animation<'_>) -> usize {
+    animation.channels().map(|channel| channel.sampler().input().count()).fold(0, usize::saturating_add)
+}
+
+fn animation_name(animation: &gltf::Animation<'_>) -> String {
+    animation.name().map_or_else(|| format!("{} (unnamed)", animation.index()), |name| format!("'{}'", shown(name)))
 }
 
 /// Returns the times of the track's poses, increasing, so that linear interpolation follows all curves.
@@ -260,10 +316,27 @@ impl Curve {
         times
     }
 
+    /// Returns the value of a key.
+    fn value(&self, key: usize) -> [f64; 4] {
+        self.values[if self.interpolation == Interpolation::CubicSpline { key * 3 + 1 } else { key }]
+    }
+
+    /// Returns whether the node turns or goes visibly, in a skeleton whose longest bone is `size` long.
+    fn moves(&self, size: f64) -> bool {
+        let first = self.value(0);
+        (1..self.nanos.len()).map(|key| self.value(key)).any(|value| match self.property {
+            Property::Rotation => unit(first).angle_between(unit(value)) > MOVES_RAD,
+            Property::Translation => {
+                DVec3::from_slice(&first).distance(DVec3::from_slice(&value)) > MOVES_PART * size.max(1e-9)
+            }
+            _ => false,
+        })
+    }
+
     fn at(&self, nanos: i64) -> [f64; 4] {
         let next = self.nanos.partition_point(|&t| t <= nanos);
         let cubic = self.interpolation == Interpolation::CubicSpline;
-        let value = |key: usize| self.values[if cubic { key * 3 + 1 } else { key }];
+        let value = |key: usize| self.value(key);
         if next == 0 {
             return value(0);
         }

@@ -3,7 +3,7 @@
 use glam::{DQuat, DVec3};
 
 use crate::bvh::BvhLocal;
-use crate::{BodyError, BvhClip, GltfHuman};
+use crate::{BodyError, BvhClip, BvhJoint, GltfHuman};
 
 /// Joint in a frame: position, and rotation away from the rest pose, both in the file's world (y up).
 #[derive(Debug, Clone, Copy, PartialEq)]
@@ -20,6 +20,8 @@ pub struct MotionClip {
     pub(crate) what: String,
     pub(crate) names: Vec<String>,
     pub(crate) parents: Vec<Option<usize>>,
+    /// Whether the format fixes the axes: right-handed, y up, as glTF does. BVH does not.
+    pub(crate) axes_are_stated: bool,
     /// Positions of the joints at rest, y up, in the file's units.
     pub(crate) origins: Vec<DVec3>,
     /// Time, nanoseconds, and joints of each frame.
@@ -30,14 +32,26 @@ impl BvhClip {
     /// Returns the clip as a motion for retargeting.
     #[must_use]
     pub fn motion(&self) -> MotionClip {
+        // Joints below the root with positions of their own: some programs leave their offsets at zero, others write
+        // the distance from the offset.
+        let first = self.locals(0);
+        let length = |at: fn(&BvhJoint, &BvhLocal) -> DVec3| -> f64 {
+            self.joints.iter().zip(&first).skip(1).map(|(joint, local)| at(joint, local).length()).sum()
+        };
+        let (offsets, placed) = (length(|joint, _| joint.offset), length(|_, local| local.translation));
+        let (no_offsets, is_relative) = (offsets < 0.1 * placed, placed < 0.1 * offsets);
         let mut origins: Vec<DVec3> = Vec::with_capacity(self.joints.len());
-        for joint in &self.joints {
-            origins.push(joint.parent.map_or(DVec3::ZERO, |parent| origins[parent] + joint.offset));
+        for (joint, local) in self.joints.iter().zip(&first) {
+            let offset = if no_offsets { local.translation } else { joint.offset };
+            origins.push(joint.parent.map_or(DVec3::ZERO, |parent| origins[parent] + offset));
         }
         let frame = |index: usize| {
             let mut world: Vec<Moved> = Vec::with_capacity(self.joints.len());
             for (joint, local) in self.joints.iter().zip(self.locals(index)) {
-                let BvhLocal { translation, rotation } = local;
+                let BvhLocal { mut translation, rotation } = local;
+                if is_relative && joint.parent.is_some() {
+                    translation += joint.offset;
+                }
                 // At rest a BVH joint has the axes of the world.
                 world.push(match joint.parent.map(|parent| world[parent]) {
                     None => Moved { position: translation, turned: rotation },
@@ -53,6 +67,7 @@ impl BvhClip {
             what: self.path.display().to_string(),
             names: self.joints.iter().map(|joint| joint.name.clone()).collect(),
             parents: self.joints.iter().map(|joint| joint.parent).collect(),
+            axes_are_stated: false,
             origins,
             frames: (0..self.frames.len()).map(frame).collect(),
         }
@@ -83,6 +98,7 @@ impl GltfHuman {
             what,
             names: joints.iter().map(|joint| joint.name.clone()).collect(),
             parents: joints.iter().map(|joint| joint.parent).collect(),
+            axes_are_stated: true,
             origins: template.skeleton.canonical_origins(),
             frames: track.keys().iter().map(frame).collect(),
         })

@@ -66,8 +66,33 @@ impl Template {
         follow(&self.positions, &partners, &mut displacement);
         let positions: Vec<Vec3> = self.positions.iter().zip(&displacement).map(|(a, b)| *a + *b).collect();
         let skeleton = refit(self, &displacement, [&from.skeleton, &to.skeleton])?;
-        let normals = turned(self, &positions);
+        let normals = self.normals_at(&positions);
         Ok(Reshaped { template: Self { positions, normals, skeleton, ..self.clone() }, displacement })
+    }
+
+    /// Returns the normals of the mesh with its vertices at other positions, one per vertex: rotated as the surface around each vertex is;
+    /// copies of a vertex at a seam rotate alike.
+    #[must_use]
+    pub fn normals_at(&self, positions: &[Vec3]) -> Vec<Vec3> {
+        let bits = |place: &Vec3| place.to_array().map(f32::to_bits);
+        let mut first: HashMap<[u32; 3], usize> = HashMap::new();
+        let same: Vec<usize> =
+            self.positions.iter().enumerate().map(|(i, place)| *first.entry(bits(place)).or_insert(i)).collect();
+        let area_normals = |positions: &[Vec3]| {
+            let mut sums = vec![Vec3::ZERO; positions.len()];
+            for triangle in &self.triangles {
+                let [a, b, c] = triangle.map(|i| positions[i as usize]);
+                let normal = (b - a).cross(c - a);
+                triangle.iter().for_each(|i| sums[same[*i as usize]] += normal);
+            }
+            sums
+        };
+        let (before, after) = (area_normals(&self.positions), area_normals(positions));
+        let of = |(i, normal): (usize, &Vec3)| match (before[same[i]].try_normalize(), after[same[i]].try_normalize()) {
+            (Some(from), Some(to)) => (Quat::from_rotation_arc(from, to) * *normal).normalize_or(*normal),
+            _ => *normal,
+        };
+        self.normals.iter().enumerate().map(of).collect()
     }
 }
 
@@ -141,29 +166,6 @@ fn shared_displacement(template: &Template, displacement: &[Vec3], joint: usize)
         .and_then(|parent| mean(&|skin| share(skin, joint).min(share(skin, parent))))
         .or_else(|| mean(&|skin| share(skin, joint)))
         .unwrap_or_default()
-}
-
-/// Returns the normals, rotated as the surface around each vertex is; copies of a vertex at a seam rotate alike.
-fn turned(template: &Template, positions: &[Vec3]) -> Vec<Vec3> {
-    let bits = |place: &Vec3| place.to_array().map(f32::to_bits);
-    let mut first: HashMap<[u32; 3], usize> = HashMap::new();
-    let same: Vec<usize> =
-        template.positions.iter().enumerate().map(|(i, place)| *first.entry(bits(place)).or_insert(i)).collect();
-    let area_normals = |positions: &[Vec3]| {
-        let mut sums = vec![Vec3::ZERO; positions.len()];
-        for triangle in &template.triangles {
-            let [a, b, c] = triangle.map(|i| positions[i as usize]);
-            let normal = (b - a).cross(c - a);
-            triangle.iter().for_each(|i| sums[same[*i as usize]] += normal);
-        }
-        sums
-    };
-    let (before, after) = (area_normals(&template.positions), area_normals(positions));
-    let of = |(i, normal): (usize, &Vec3)| match (before[same[i]].try_normalize(), after[same[i]].try_normalize()) {
-        (Some(from), Some(to)) => (Quat::from_rotation_arc(from, to) * *normal).normalize_or(*normal),
-        _ => *normal,
-    };
-    template.normals.iter().enumerate().map(of).collect()
 }
 
 #[cfg(test)]

@@ -3,10 +3,12 @@
 use flyrig_types::{Pose, PoseTrack};
 use glam::{DQuat, DVec2, DVec3};
 
-use crate::foot_contacts::{FootSource, plant_feet};
+use crate::clip_axes::Landmarks;
+use crate::foot_contacts::{FootSource, level_feet, plant_feet};
 use crate::joint_names::{Named, match_joints};
 use crate::motion_clip::{MotionClip, Moved};
 use crate::part::part_of_joints;
+use crate::rest_alignment::at_source_rest;
 use crate::{BodyError, BvhClip, Part, Skeleton};
 
 /// Rotation about x from the files' y up to the z up of our pose tracks, radians.
@@ -49,15 +51,30 @@ impl MotionClip {
     /// matter). World: z up, the floor at z = 0; a motion that faces +z of the file faces -y.
     ///
     /// A joint rotates in the world as the source's does from its rest pose. The source may rest in another pose than our bind pose:
-    /// arms and legs are first turned to its rest directions, hands follow the arms, trunk and feet keep their own shape. Joints that
-    /// the source lacks stay at rest. The path of the hips is scaled by the length of the legs, and lifted so that the feet are on the
-    /// floor when they are lowest (5 % of the frames). Where a foot of the source stands (low and slow), ours is held in place and on the floor by
-    /// two-bone inverse kinematics, and hips too high for that are lowered smoothly.
+    /// `rest_alignment.rs` says how trunk and limbs are turned to it first. A format that states no axes (BVH) is checked against the
+    /// person: other axes than y up, right-handed, are turned, with a warning. Joints that the source lacks stay at rest; a
+    /// warning names them. The path of the hips is scaled by the length of the legs, and lifted so that the feet are on the
+    /// floor when they are lowest (5 % of the frames). Feet are turned so that they are level where the source's stand (heel and ball low and slow).
+    /// There, ours are held in place and on the floor by two-bone inverse kinematics, and hips too high for that are lowered smoothly.
     ///
     /// # Errors
     /// [`BodyError::Skeleton`] lists the legs' joints that are missing on either side, [`BodyError::Track`].
     pub fn retarget(&self, skeleton: &Skeleton, options: &RetargetOptions) -> Result<PoseTrack, BodyError> {
-        let map = Map::new(self, skeleton)?;
+        let named: Vec<Named<'_>> =
+            self.names.iter().zip(&self.parents).map(|(name, &parent)| Named { name, parent }).collect();
+        let source = match_joints(skeleton, &named, &self.what)?;
+        let turned = self.with_usual_axes(&landmarks(skeleton, &source)?);
+        turned.as_ref().unwrap_or(self).retarget_matched(skeleton, source, options)
+    }
+
+    /// Transfers the motion with the source joint of each joint of `skeleton`.
+    fn retarget_matched(
+        &self,
+        skeleton: &Skeleton,
+        source: Vec<Option<usize>>,
+        options: &RetargetOptions,
+    ) -> Result<PoseTrack, BodyError> {
+        let map = Map::new(self, skeleton, source)?;
         let start_nanos =
             self.frames.first().map_or(0, |frame| frame.0).saturating_add((options.start_secs * 1e9) as i64);
         let last = self.frames.len().saturating_sub(1);
@@ -84,10 +101,23 @@ impl MotionClip {
             };
             FootSource { ankle: track(leg.theirs[2]), toe: leg.their_toe.map(track) }
         });
-        plant_feet(skeleton, &map.legs.map(|leg| leg.ours), options.sole_m, &nanos, &feet, &mut poses);
+        let legs = map.legs.map(|leg| leg.ours);
+        level_feet(skeleton, &legs, &nanos, &feet, &mut poses);
+        plant_feet(skeleton, &legs, options.sole_m, &nanos, &feet, &mut poses);
         let keys = nanos.into_iter().zip(poses).collect();
         PoseTrack::new(keys).map_err(|source| BodyError::Track { what: self.what.clone(), source })
     }
+}
+
+/// Returns the joints of the source that show its axes.
+fn landmarks(skeleton: &Skeleton, source: &[Option<usize>]) -> Result<Landmarks, BodyError> {
+    let theirs = |name: &str| skeleton.joint(name).and_then(|joint| source[joint]);
+    let leg = |[hip, knee, ankle, toe]: [&str; 4]| Some(([theirs(hip)?, theirs(knee)?, theirs(ankle)?], theirs(toe)));
+    // `match_joints` has found both legs.
+    let missing = || BodyError::Skeleton("the motion has no legs".to_owned());
+    let legs = [leg(LEGS[0]).ok_or_else(missing)?, leg(LEGS[1]).ok_or_else(missing)?];
+    let top = ["Head", "Neck", "Spine1", "Spine"].into_iter().find_map(theirs);
+    Ok(Landmarks { top, legs })
 }
 
 /// Moves the middle of the path to the origin and scales it down to `reach_m`.
@@ -128,11 +158,8 @@ struct Map<'a> {
 }
 
 impl<'a> Map<'a> {
-    fn new(clip: &MotionClip, skeleton: &'a Skeleton) -> Result<Self, BodyError> {
+    fn new(clip: &MotionClip, skeleton: &'a Skeleton, source: Vec<Option<usize>>) -> Result<Self, BodyError> {
         let joints = skeleton.joints();
-        let named: Vec<Named<'_>> =
-            clip.names.iter().zip(&clip.parents).map(|(name, &parent)| Named { name, parent }).collect();
-        let source = match_joints(skeleton, &named, &clip.what)?;
         let origins = skeleton.canonical_origins();
         let (mut ours, mut theirs) = (0.0, 0.0);
         let mut legs = Vec::new();
@@ -162,28 +189,8 @@ impl<'a> Map<'a> {
             return Err(BodyError::Skeleton(format!("{} or the body has legs of no length", clip.what)));
         }
 
+        let at_source_rest = at_source_rest(clip, skeleton, &source);
         let parts = part_of_joints(skeleton);
-        let mut turned: Vec<DQuat> = Vec::with_capacity(joints.len());
-        for (index, joint) in joints.iter().enumerate() {
-            let parent = joint.parent.map_or(DQuat::IDENTITY, |parent| turned[parent]);
-            turned.push(match parts[index] {
-                Part::LeftArm | Part::RightArm | Part::LeftLeg | Part::RightLeg => {
-                    // Along the limb: the nearest joint below that both sides know.
-                    let next = (index + 1..joints.len())
-                        .find(|&below| joints[below].parent == Some(index) && source[below].is_some());
-                    let direction = next.zip(source[index]).and_then(|(next, theirs)| {
-                        let ours = (origins[next] - origins[index]).try_normalize()?;
-                        let clips = (clip.origins[source[next]?] - clip.origins[theirs]).try_normalize()?;
-                        Some(DQuat::from_rotation_arc(ours, clips))
-                    });
-                    direction.unwrap_or(parent)
-                }
-                Part::LeftHand | Part::RightHand => parent,
-                _ => DQuat::IDENTITY,
-            });
-        }
-        let at_source_rest =
-            joints.iter().zip(&turned).map(|(joint, turned)| *turned * joint.bind_rotation()).collect();
         let is_foot = |part: &Part| matches!(part, Part::LeftFoot | Part::RightFoot);
         let feet: Vec<usize> = (0..joints.len()).filter(|&index| is_foot(&parts[index])).collect();
         let lowest = feet.iter().map(|&foot| origins[foot].y).fold(f64::INFINITY, f64::min);

@@ -3,7 +3,8 @@
 use flyrig_types::Pose;
 use glam::{DMat4, DQuat, DVec3};
 
-use crate::BodyError;
+use crate::part::part_of_joints;
+use crate::{BodyError, Part};
 
 /// Joint of a skeleton.
 #[derive(Debug, Clone, PartialEq)]
@@ -111,6 +112,20 @@ impl Skeleton {
             return Err(BodyError::Pose("a number is not finite or a rotation is not of unit length".to_owned()));
         }
         Ok(())
+    }
+
+    /// Returns the direction from the feet to the head in a pose, a unit vector in the world; `None` for a skeleton without joints
+    /// of these names.
+    #[must_use]
+    pub fn standing(&self, pose: &Pose) -> Option<DVec3> {
+        let parts = part_of_joints(self);
+        let world = self.world_from_joint(pose);
+        let mean = |wanted: &[Part]| {
+            let of = |(part, world): (&Part, &DMat4)| wanted.contains(part).then(|| world.w_axis.truncate());
+            let places: Vec<DVec3> = parts.iter().zip(&world).filter_map(of).collect();
+            (!places.is_empty()).then(|| places.iter().sum::<DVec3>() / places.len() as f64)
+        };
+        (mean(&[Part::Head])? - mean(&[Part::LeftFoot, Part::RightFoot])?).try_normalize()
     }
 
     /// Computes forward kinematics: `world_from_joint` of each joint. The root lies at the pose's root translation, other joints at

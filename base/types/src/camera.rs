@@ -454,16 +454,6 @@ impl Rig {
     pub fn slot(&self, id: &CameraId) -> Option<usize> {
         self.cameras.iter().position(|camera| camera.id == *id)
     }
-
-    /// Returns the world axis closest to "up" in the cameras' images, for data sets that do not state it.
-    #[must_use]
-    pub fn guess_world_up(cameras: &[Camera]) -> DVec3 {
-        let up: DVec3 = cameras.iter().map(|c| c.camera_from_world.rotation.inverse() * DVec3::NEG_Y).sum();
-        [DVec3::Z, DVec3::Y, DVec3::X, DVec3::NEG_Z, DVec3::NEG_Y, DVec3::NEG_X]
-            .into_iter()
-            .max_by(|a, b| up.dot(*a).total_cmp(&up.dot(*b)))
-            .unwrap_or(DVec3::Z)
-    }
 }
 
 #[cfg(test)]
@@ -582,10 +572,5 @@ mod tests {
         let good = camera(Lens::PINHOLE);
         let rig = Rig { cameras: vec![good.clone(), good], world_up: DVec3::Z };
         assert_eq!(rig.validate().unwrap_err(), CameraError::Duplicate("a".into()));
-    }
-
-    #[test]
-    fn up_is_guessed_from_level_cameras() {
-        assert_eq!(Rig::guess_world_up(&[camera(Lens::PINHOLE)]), DVec3::Z);
     }
 }

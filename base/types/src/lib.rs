@@ -25,7 +25,9 @@ mod pose;
 mod printable;
 mod rendered_view;
 mod restarts;
+mod seconds;
 mod supervised;
+mod text_file;
 mod whole_file;
 
 pub use camera::{Camera, CameraError, Intrinsics, Lens, MAX_IMAGE_SIDE, Rig};
@@ -42,5 +44,7 @@ pub use pose::{Pose, PoseError, PoseTrack};
 pub use printable::{MAX_PRINTABLE, escape_controls, printable, shorten_values, shortened};
 pub use rendered_view::RenderedView;
 pub use restarts::Restarts;
+pub use seconds::{deadline_after, saturating_secs};
 pub use supervised::{SupervisedThread, ThreadHealth, ThreadWatch};
+pub use text_file::{decode_text, read_text, read_text_up_to};
 pub use whole_file::write_whole;

@@ -4,30 +4,47 @@
 
 use std::{fmt::Write as _, path::Path};
 
-use flyrig_types::{CameraId, Isometry, Lens, Rig};
-use glam::{DMat3, DQuat, DVec2, DVec3};
+use flyrig_types::{CameraId, Isometry, Rig};
+use glam::{DMat3, DQuat, DVec3};
 use toml::{Table, Value};
 
 use super::{
     imported::{Imported, ImportedCamera},
-    shared::{bad, intrinsics, opencv_coefficients, opencv_lens, rotation_of},
+    shared::{
+        bad, camera_matrix, fisheye_lens, intrinsics, opencv_coefficients, opencv_lens, refuse_unknown, rotation_of,
+    },
 };
 use crate::calibration_file;
 use crate::error::CalibError;
 
 pub(super) const FILE: &str = "anipose.toml";
+/// Keys of a camera that are understood. caliscope turns images for display alone (`rotation_count`).
+const KEYS: [&str; 7] = ["matrix", "distortions", "fisheye", "rotation", "translation", "size", "rotation_count"];
 
 pub(super) fn read(path: &Path) -> Result<Imported, CalibError> {
     let text = calibration_file::read(path)?;
     let root: Table =
         text.parse().map_err(|error: toml::de::Error| bad(path, format!("is no TOML: {}", error.message())))?;
     let tables = root.get("cameras").and_then(Value::as_table).unwrap_or(&root);
+    let scalars = root.iter().filter(|(_, value)| !value.is_table()).map(|(key, _)| key.as_str());
+    let metadata = root.get("metadata").and_then(Value::as_table).into_iter().flatten().map(|(key, _)| key.as_str());
+    refuse_unknown(scalars.chain(metadata), &[]).map_err(|problem| bad(path, problem))?;
+    // A table with neither is the board's, for example.
+    let is_camera = |table: &&Table| table.contains_key("matrix") || table.contains_key("size");
     let cameras = tables
         .iter()
-        .filter_map(|(key, value)| Some((key, value.as_table().filter(|table| table.contains_key("matrix"))?)))
+        .filter_map(|(key, value)| Some((key, value.as_table().filter(is_camera)?)))
         .map(|(key, table)| camera(key, table).map_err(|problem| bad(path, format!("camera {key}: {problem}"))))
         .collect::<Result<_, _>>()?;
-    Ok(Imported { cameras, up: None })
+    let mut imported = Imported::new(cameras, None);
+    for (key, table) in tables.iter().filter_map(|(key, value)| Some((key, value.as_table()?))) {
+        if table.get("rotation_count").is_some_and(|turns| turns.as_integer() != Some(0)) {
+            imported.warnings.push(format!(
+                "camera {key}: rotation_count turns images for display; the lens is of images as recorded"
+            ));
+        }
+    }
+    Ok(imported)
 }
 
 fn number(value: &Value) -> Option<f64> {
@@ -44,19 +61,24 @@ fn rows3(value: &Value) -> Option<[f64; 9]> {
 }
 
 fn camera(key: &str, table: &Table) -> Result<ImportedCamera, String> {
+    refuse_unknown(table.keys().map(String::as_str), &KEYS)?;
     let missing = |key: &str| format!("{key} is missing or not what it should be; export it again");
     let list = |key: &str| table.get(key).and_then(numbers).ok_or_else(|| missing(key));
-    let [fx, skew, cx, zero, fy, cy, ..] = table.get("matrix").and_then(rows3).ok_or_else(|| missing("matrix"))?;
-    if skew.abs() > 0.01 || zero != 0.0 {
-        return Err("matrix has skew; calibrate without it".to_owned());
-    }
+    let matrix = table.get("matrix").and_then(rows3).ok_or_else(|| missing("matrix"))?;
+    let (focal, center) = camera_matrix(&matrix).map_err(|problem| format!("matrix {problem}"))?;
     let &[width, height] = list("size")?.as_slice() else { return Err(missing("size")) };
-    let distortions = list("distortions")?;
-    let lens = match (table.get("fisheye").and_then(Value::as_bool), distortions.as_slice()) {
-        (Some(true), &[k1, k2, k3, k4]) => Lens::Fisheye { coefficients: [k1, k2, k3, k4] },
-        (Some(true), other) => return Err(format!("{} coefficients of a fisheye, expected 4", other.len())),
-        (_, values) => opencv_lens(values)?,
+    // Some versions write OpenCV's array of one row.
+    let nested = table.get("distortions").and_then(Value::as_array).filter(|rows| rows.len() == 1);
+    let distortions = match nested.and_then(|rows| numbers(&rows[0])) {
+        Some(row) => row,
+        None => list("distortions")?,
     };
+    let is_fisheye = match table.get("fisheye") {
+        None | Some(Value::Boolean(false) | Value::Integer(0)) => false,
+        Some(Value::Boolean(true) | Value::Integer(1)) => true,
+        Some(other) => return Err(format!("fisheye is {other}, neither true nor false")),
+    };
+    let lens = if is_fisheye { fisheye_lens(&distortions)? } else { opencv_lens(&distortions)? };
     let pose = match (table.get("rotation"), table.get("translation")) {
         (Some(rotation), Some(_)) => {
             let &[x, y, z] = list("translation")?.as_slice() else { return Err(missing("translation")) };
@@ -73,13 +95,8 @@ fn camera(key: &str, table: &Table) -> Result<ImportedCamera, String> {
     };
     // anipose counts its tables and names the camera inside; caliscope numbers both.
     let name = table.get("name").and_then(Value::as_str).unwrap_or(key);
-    Ok(ImportedCamera {
-        id: CameraId::from(name),
-        intrinsics: intrinsics([width, height], DVec2::new(fx, fy), DVec2::new(cx, cy), lens),
-        pose,
-        time_offset_nanos: 0,
-        color: Default::default(),
-    })
+    let intrinsics = intrinsics([width, height], focal, center, lens);
+    Ok(ImportedCamera { id: CameraId::from(name), ..ImportedCamera::unnamed(intrinsics, pose) })
 }
 
 pub(super) fn text(rig: &Rig) -> String {

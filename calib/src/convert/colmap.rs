@@ -1,4 +1,5 @@
-//! COLMAP's text model: `cameras.txt` and `images.txt`, one image per camera.
+//! COLMAP's models, as text (`cameras.txt`, `images.txt`) and binary (`cameras.bin`, `images.bin`), with any number of images of each
+//! camera. The rigs and frames of COLMAP 3.12 need not be read: images keep their own poses.
 //!
 //! COLMAP puts the centre of the first pixel at (0.5, 0.5): half a pixel is subtracted from its principal point.
 
@@ -8,69 +9,116 @@ use std::{
     path::{Path, PathBuf},
 };
 
-use flyrig_types::{Intrinsics, Isometry, Lens, Rig};
-use glam::{DQuat, DVec2, DVec3};
+use flyrig_types::{Intrinsics, Isometry, Rig, read_text_up_to};
 
 use super::{
+    colmap_binary,
+    colmap_models::{lens, model, named, pose, shot},
+    image_names::Shot,
     imported::{Imported, ImportedCamera},
-    shared::{bad, camera_of_image, intrinsics},
+    shared::bad,
 };
 use crate::calibration_file;
 use crate::error::CalibError;
 
 pub(super) const CAMERAS: &str = "cameras.txt";
 const IMAGES: &str = "images.txt";
-/// Largest difference between the poses of one camera in two images, units of the file and radians.
-const SAME_POSE: f64 = 1e-6;
+/// Largest text of images: it lists all their points.
+const MAX_IMAGES_BYTES: u64 = 512 << 20;
+/// Largest difference of a number that was written as text, relative to 1 or to the number.
+const TEXT_TOLERANCE: f64 = 1e-6;
+/// Returns the folder of the model: the folder itself, or `sparse/0` or `sparse` of a workspace with one model.
+pub(super) fn model_folder(dir: &Path) -> Option<PathBuf> {
+    let is_model = |dir: &PathBuf| dir.join(CAMERAS).is_file() || dir.join(colmap_binary::CAMERAS).is_file();
+    let several = dir.join("sparse/1").is_dir();
+    [dir.to_owned(), dir.join("sparse/0"), dir.join("sparse")]
+        .into_iter()
+        .find(is_model)
+        .filter(|found| !several || found == dir)
+}
 
 pub(super) fn read(dir: &Path) -> Result<Imported, CalibError> {
+    let dir = model_folder(dir).unwrap_or_else(|| dir.to_owned());
+    let text = || read_text(&dir);
+    let binary = || colmap_binary::read(&dir);
+    let cameras = match (dir.join(CAMERAS).is_file(), dir.join(colmap_binary::CAMERAS).is_file()) {
+        (true, true) => {
+            let (text, binary) = (text()?, binary()?);
+            if !agree(&text, &binary) {
+                return Err(bad(&dir, "holds a model as text and another one as *.bin; take the older one out"));
+            }
+            binary
+        }
+        (false, true) => binary()?,
+        (_, false) => text()?,
+    };
+    Ok(Imported::new(cameras, None))
+}
+
+/// Returns whether cameras are the same up to the rounding of text.
+fn agree(a: &[ImportedCamera], b: &[ImportedCamera]) -> bool {
+    let numbers = |camera: &ImportedCamera| {
+        let i = &camera.intrinsics;
+        let pose = camera.pose.unwrap_or(Isometry::IDENTITY);
+        // A quaternion and its negative turn alike.
+        let q = pose.rotation * pose.rotation.w.signum();
+        let mut all =
+            vec![f64::from(i.width), f64::from(i.height), i.focal_px.x, i.focal_px.y, i.center_px.x, i.center_px.y];
+        all.extend(i.lens.coefficients());
+        all.extend([q.x, q.y, q.z, q.w].into_iter().chain(pose.translation.to_array()));
+        all
+    };
+    let is_same = |(a, b): (&ImportedCamera, &ImportedCamera)| {
+        let (x, y) = (numbers(a), numbers(b));
+        let is_near = |(x, y): (&f64, &f64)| (x - y).abs() <= TEXT_TOLERANCE * x.abs().max(1.0);
+        a.id == b.id && x.len() == y.len() && x.iter().zip(&y).all(is_near)
+    };
+    a.len() == b.len() && a.iter().zip(b).all(is_same)
+}
+
+fn read_text(dir: &Path) -> Result<Vec<ImportedCamera>, CalibError> {
     let cameras_path = dir.join(CAMERAS);
-    if !cameras_path.exists() && dir.join("cameras.bin").exists() {
-        return Err(bad(dir, "is a binary model; convert it with colmap model_converter --output_type TXT"));
-    }
     let mut lenses = BTreeMap::new();
     for (number, line) in content(&calibration_file::read(&cameras_path)?) {
+        let refused = |problem: String| bad(&cameras_path, format!("line {number}: {problem}"));
         let fields: Vec<&str> = line.split_whitespace().collect();
-        let lens = lens(&fields).map_err(|problem| bad(&cameras_path, format!("line {number}: {problem}")))?;
-        lenses.insert(fields[0].to_owned(), lens);
+        let [id, model, width, height, parameters @ ..] = fields.as_slice() else {
+            return Err(refused("expected CAMERA_ID MODEL WIDTH HEIGHT PARAMS".to_owned()));
+        };
+        let read = || lens(model, &numbers(&[*width, *height])?, &numbers(parameters)?);
+        if lenses.insert((*id).to_owned(), read().map_err(refused)?).is_some() {
+            return Err(refused(format!("camera {id} is there twice; take one out")));
+        }
     }
     let images_path = dir.join(IMAGES);
-    let text = calibration_file::read(&images_path)?;
-    let mut cameras: Vec<ImportedCamera> = Vec::new();
+    let text = read_text_up_to(&images_path, MAX_IMAGES_BYTES)
+        .map_err(|source| calibration_file::read_error(&images_path, source))?;
+    let mut shots = Vec::new();
     let mut is_points = false;
     for (number, line) in text.lines().enumerate().map(|(i, line)| (i + 1, line.trim())) {
         if line.starts_with('#') {
             continue;
         }
+        let place = format!("line {number}");
         // The second line of an image lists its points, and may be empty.
         if std::mem::take(&mut is_points) {
+            let is_list = line.split_whitespace().count() % 3 == 0
+                && line.split_whitespace().next_back().is_none_or(|id| id.parse::<i64>().is_ok());
+            if !is_list {
+                let expected = "expected the points of the image above as X Y POINT3D_ID, or an empty line";
+                return Err(bad(&images_path, format!("{place}: {expected}; export the model again")));
+            }
             continue;
         }
         if line.is_empty() {
             continue;
         }
         is_points = true;
-        let camera = image(line, &lenses).map_err(|problem| bad(&images_path, format!("line {number}: {problem}")))?;
-        let Some(known) = cameras.iter().find(|known| known.id == camera.id) else {
-            cameras.push(camera);
-            continue;
-        };
-        if !same_pose(known, &camera) {
-            let problem = format!("line {number}: camera {} has two poses; give one image of each camera", camera.id);
-            return Err(bad(&images_path, problem));
-        }
+        shots.push(
+            image(line, &lenses, place.clone()).map_err(|problem| bad(&images_path, format!("{place}: {problem}")))?,
+        );
     }
-    cameras.sort_by(|a, b| a.id.cmp(&b.id));
-    Ok(Imported { cameras, up: None })
-}
-
-pub(super) fn same_pose(a: &ImportedCamera, b: &ImportedCamera) -> bool {
-    match (a.pose, b.pose) {
-        (Some(a), Some(b)) => {
-            a.rotation.angle_between(b.rotation) < SAME_POSE && a.translation.distance(b.translation) < SAME_POSE
-        }
-        _ => false,
-    }
+    named(&images_path, shots)
 }
 
 fn content(text: &str) -> impl Iterator<Item = (usize, &str)> {
@@ -86,90 +134,35 @@ fn numbers(fields: &[&str]) -> Result<Vec<f64>, String> {
     fields.iter().map(number).collect()
 }
 
-fn lens(fields: &[&str]) -> Result<Intrinsics, String> {
-    let [_, model, width, height, parameters @ ..] = fields else {
-        return Err("expected CAMERA_ID MODEL WIDTH HEIGHT PARAMS".to_owned());
-    };
-    let size = numbers(&[*width, *height])?;
-    let parameters = numbers(parameters)?;
-    let plain = |radial, tangential| Lens::RadialTangential { radial, tangential };
-    let (focal, center, lens) = match (*model, parameters.as_slice()) {
-        ("SIMPLE_PINHOLE", &[f, cx, cy]) => ([f, f], [cx, cy], Lens::PINHOLE),
-        ("PINHOLE", &[fx, fy, cx, cy]) => ([fx, fy], [cx, cy], Lens::PINHOLE),
-        ("SIMPLE_RADIAL", &[f, cx, cy, k]) => ([f, f], [cx, cy], plain([k, 0.0, 0.0], [0.0; 2])),
-        ("RADIAL", &[f, cx, cy, k1, k2]) => ([f, f], [cx, cy], plain([k1, k2, 0.0], [0.0; 2])),
-        ("OPENCV", &[fx, fy, cx, cy, k1, k2, p1, p2]) => ([fx, fy], [cx, cy], plain([k1, k2, 0.0], [p1, p2])),
-        ("FULL_OPENCV", &[fx, fy, cx, cy, ref rest @ ..]) if rest.len() == 8 => {
-            ([fx, fy], [cx, cy], super::shared::opencv_lens(rest)?)
-        }
-        ("OPENCV_FISHEYE", &[fx, fy, cx, cy, k1, k2, k3, k4]) => {
-            ([fx, fy], [cx, cy], Lens::Fisheye { coefficients: [k1, k2, k3, k4] })
-        }
-        ("SIMPLE_RADIAL_FISHEYE", &[f, cx, cy, k]) => {
-            ([f, f], [cx, cy], Lens::Fisheye { coefficients: [k, 0.0, 0.0, 0.0] })
-        }
-        ("RADIAL_FISHEYE", &[f, cx, cy, k1, k2]) => {
-            ([f, f], [cx, cy], Lens::Fisheye { coefficients: [k1, k2, 0.0, 0.0] })
-        }
-        (model, parameters) => {
-            return Err(format!(
-                "camera model {model} with {} parameters is not supported; use OPENCV, FULL_OPENCV or OPENCV_FISHEYE",
-                parameters.len()
-            ));
-        }
-    };
-    Ok(intrinsics([size[0], size[1]], DVec2::from(focal), DVec2::from(center) - 0.5, lens))
-}
-
-fn image(line: &str, lenses: &BTreeMap<String, Intrinsics>) -> Result<ImportedCamera, String> {
-    let fields: Vec<&str> = line.split_whitespace().collect();
-    let [_, pose @ .., camera, name] = fields.as_slice() else {
-        return Err("expected IMAGE_ID QW QX QY QZ TX TY TZ CAMERA_ID NAME".to_owned());
-    };
-    let &[w, x, y, z, tx, ty, tz] = numbers(pose)?.as_slice() else {
-        return Err("expected IMAGE_ID QW QX QY QZ TX TY TZ CAMERA_ID NAME, without spaces in the name".to_owned());
-    };
-    let rotation = DQuat::from_xyzw(x, y, z, w);
-    if (rotation.length() - 1.0).abs() > 1e-3 {
-        return Err(format!("the quaternion has length {:.4}, expected 1", rotation.length()));
+fn image(line: &str, lenses: &BTreeMap<String, Intrinsics>, place: String) -> Result<Shot, String> {
+    let mut fields = Vec::new();
+    let mut name = line;
+    for _ in 0..9 {
+        let (field, rest) =
+            name.split_once(char::is_whitespace).ok_or("expected IMAGE_ID QW QX QY QZ TX TY TZ CAMERA_ID NAME")?;
+        fields.push(field);
+        name = rest.trim_start();
     }
-    let intrinsics = lenses.get(*camera).ok_or_else(|| format!("camera {camera} is not in {CAMERAS}"))?;
-    Ok(ImportedCamera {
-        id: camera_of_image(name),
-        intrinsics: *intrinsics,
-        pose: Some(Isometry::new(rotation.normalize(), DVec3::new(tx, ty, tz))),
-        time_offset_nanos: 0,
-        color: Default::default(),
-    })
+    let pose = numbers(&fields[1..8])?;
+    let intrinsics = lenses.get(fields[8]).ok_or_else(|| format!("camera {} is not in {CAMERAS}", fields[8]))?;
+    shot(name, place, *intrinsics, &pose)
 }
 
-pub(super) fn files(rig: &Rig) -> Vec<(String, String)> {
+/// Returns the files of a model, text and binary: COLMAP's own programs prefer the second, people the first.
+pub(super) fn files(rig: &Rig) -> Vec<(String, Vec<u8>)> {
     let mut cameras = "# CAMERA_ID, MODEL, WIDTH, HEIGHT, PARAMS[]\n".to_owned();
     let mut images =
         "# IMAGE_ID, QW, QX, QY, QZ, TX, TY, TZ, CAMERA_ID, NAME\n# POINTS2D[] as (X, Y, POINT3D_ID)\n".to_owned();
+    let words = |numbers: &[f64]| numbers.iter().map(|value| format!("{value:?}")).collect::<Vec<_>>().join(" ");
     for (number, camera) in rig.cameras.iter().enumerate().map(|(i, camera)| (i + 1, camera)) {
         let i = &camera.intrinsics;
-        let (model, coefficients) = match i.lens {
-            Lens::RadialTangential { radial: [k1, k2, 0.0], tangential: [p1, p2] } => ("OPENCV", vec![k1, k2, p1, p2]),
-            Lens::Fisheye { coefficients } => ("OPENCV_FISHEYE", coefficients.to_vec()),
-            lens => {
-                let ([k1, k2, k3, k4, k5, k6], [p1, p2]) = lens.rational().unwrap_or_default();
-                ("FULL_OPENCV", vec![k1, k2, p1, p2, k3, k4, k5, k6])
-            }
-        };
-        let center = i.center_px + 0.5;
-        let parameters = [vec![i.focal_px.x, i.focal_px.y, center.x, center.y], coefficients].concat();
-        let parameters: Vec<String> = parameters.iter().map(|value| format!("{value:?}")).collect();
-        let _ = writeln!(cameras, "{number} {model} {} {} {}", i.width, i.height, parameters.join(" "));
-        let (q, t) = (camera.camera_from_world.rotation, camera.camera_from_world.translation);
-        let _ = writeln!(
-            images,
-            "{number} {:?} {:?} {:?} {:?} {:?} {:?} {:?} {number} {}.png\n",
-            q.w, q.x, q.y, q.z, t.x, t.y, t.z, camera.id
-        );
+        let (model, parameters) = model(i);
+        let _ = writeln!(cameras, "{number} {model} {} {} {}", i.width, i.height, words(&parameters));
+        let _ = writeln!(images, "{number} {} {number} {}.png\n", words(&pose(camera)), camera.id);
     }
     let points = "# POINT3D_ID, X, Y, Z, R, G, B, ERROR, TRACK[]\n".to_owned();
-    let named =
-        [(PathBuf::from(CAMERAS), cameras), (PathBuf::from(IMAGES), images), (PathBuf::from("points3D.txt"), points)];
-    named.into_iter().map(|(name, text)| (name.to_string_lossy().into_owned(), text)).collect()
+    let text =
+        [(CAMERAS, cameras), (IMAGES, images), ("points3D.txt", points)].map(|(name, text)| (name, text.into_bytes()));
+    let all = text.into_iter().chain(colmap_binary::files(rig));
+    all.map(|(name, bytes)| (name.to_owned(), bytes)).collect()
 }

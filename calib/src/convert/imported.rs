@@ -7,12 +7,7 @@ use glam::DVec3;
 
 use super::shared::bad;
 use crate::error::CalibError;
-
-/// Largest spread of a level rig's right-hand axes out of their common plane, relative to their spread within it.
-const LEVEL_SHARE: f64 = 0.2;
-/// Angles to a world axis within which it is always up, and beyond which it never is, radians.
-const LEAST_SNAP_RAD: f64 = 0.02;
-const MOST_SNAP_RAD: f64 = 0.35;
+use crate::up::level_up;
 
 /// Cameras of a file; poses may be unknown.
 #[derive(Debug, Clone)]
@@ -21,6 +16,8 @@ pub struct Imported {
     pub cameras: Vec<ImportedCamera>,
     /// Unit vector against gravity, world axes, where the format contains it.
     pub up: Option<DVec3>,
+    /// Statements of the file that flyrig cannot represent and that change no lens or pose, for the user.
+    pub warnings: Vec<String>,
 }
 
 /// Camera whose pose may be unknown.
@@ -39,6 +36,11 @@ pub struct ImportedCamera {
 }
 
 impl ImportedCamera {
+    /// Creates a camera whose name is set later.
+    pub(super) fn unnamed(intrinsics: Intrinsics, pose: Option<Isometry>) -> Self {
+        Self { id: CameraId::from(""), intrinsics, pose, time_offset_nanos: 0, color: ColorMatch::NONE }
+    }
+
     pub(super) fn scale(&mut self, scale: f64) {
         if let Some(pose) = &mut self.pose {
             pose.translation *= scale;
@@ -63,6 +65,12 @@ impl ImportedCamera {
 }
 
 impl Imported {
+    /// Returns cameras of a file that raised no warnings. `up` is a unit vector against gravity, world axes, where it is known.
+    #[must_use]
+    pub fn new(cameras: Vec<ImportedCamera>, up: Option<DVec3>) -> Self {
+        Self { cameras, up, warnings: Vec::new() }
+    }
+
     /// Returns the rig, with an estimate of the up direction where the file lacks it; `None` where no camera has a
     /// pose.
     ///
@@ -92,31 +100,4 @@ impl Imported {
     pub fn lenses(&self) -> Vec<(CameraId, Intrinsics)> {
         self.cameras.iter().map(|camera| (camera.id.clone(), camera.intrinsics)).collect()
     }
-}
-
-/// Estimates the up direction of cameras that are held level, at any pitch: normal to their right-hand axes, or the
-/// world axis within their scatter about level. Where those axes are nearly parallel, the mean of the cameras' own up
-/// directions.
-fn level_up(cameras: &[Camera]) -> DVec3 {
-    let axis = |camera: &Camera, axis: DVec3| camera.camera_from_world.rotation.inverse() * axis;
-    let above: DVec3 = cameras.iter().map(|camera| axis(camera, DVec3::NEG_Y)).sum();
-    let mut moments = nalgebra::Matrix3::<f64>::zeros();
-    for camera in cameras {
-        let right = nalgebra::Vector3::from(axis(camera, DVec3::X).to_array());
-        moments += right * right.transpose();
-    }
-    let eigen = moments.symmetric_eigen();
-    let mut order = [0, 1, 2];
-    order.sort_by(|&a, &b| eigen.eigenvalues[a].total_cmp(&eigen.eigenvalues[b]));
-    let normal = eigen.eigenvectors.column(order[0]);
-    let normal = DVec3::new(normal[0], normal[1], normal[2]);
-    let is_plane = eigen.eigenvalues[order[0]] < LEVEL_SHARE * eigen.eigenvalues[order[1]];
-    let Some(normal) = normal.try_normalize().filter(|_| is_plane) else {
-        return above.try_normalize().unwrap_or(DVec3::Z);
-    };
-    let up = normal * normal.dot(above).signum();
-    let scatter = (eigen.eigenvalues[order[0]].max(0.0) / eigen.eigenvalues[order[1]]).sqrt().atan();
-    let near = (2.0 * scatter).clamp(LEAST_SNAP_RAD, MOST_SNAP_RAD);
-    let axes = [DVec3::X, DVec3::Y, DVec3::Z].map(|axis| axis * axis.dot(up).signum());
-    axes.into_iter().find(|axis| axis.angle_between(up) < near).unwrap_or(up)
 }

@@ -10,12 +10,14 @@ use serde_json::Value;
 use super::{
     imported::{Imported, ImportedCamera},
     python,
-    shared::{bad, files_with, intrinsics, opencv_coefficients, opencv_lens},
+    shared::{bad, files_with, intrinsics, opencv_coefficients, opencv_lens, refuse_unknown},
 };
 use crate::calibration_file;
 use crate::error::CalibError;
 
 const ENDING: &str = ".cameramodel";
+/// Keys that are understood.
+const KEYS: [&str; 5] = ["lensmodel", "lens_model", "distortion_model", "extrinsics", "rt_cam_ref"];
 
 pub(super) fn read(path: &Path) -> Result<Imported, CalibError> {
     let files = if path.is_dir() { files_with(path, ENDING)? } else { vec![path.to_owned()] };
@@ -26,21 +28,25 @@ pub(super) fn read(path: &Path) -> Result<Imported, CalibError> {
         let id = CameraId::from(file.file_stem().unwrap_or_default().to_string_lossy().as_ref());
         model(id, &root).map_err(|problem| bad(file, problem))
     };
-    Ok(Imported { cameras: files.iter().map(camera).collect::<Result<_, _>>()?, up: None })
+    Ok(Imported::new(files.iter().map(camera).collect::<Result<_, _>>()?, None))
 }
 
 fn model(id: CameraId, root: &Value) -> Result<ImportedCamera, String> {
+    refuse_unknown(root.as_object().into_iter().flatten().map(|(key, _)| key.as_str()), &KEYS)?;
     let any = |keys: &[&str]| keys.iter().find_map(|key| root.get(key));
     let list = |keys: &[&str]| -> Result<Vec<f64>, String> {
         let numbers = any(keys).and_then(Value::as_array).and_then(|list| list.iter().map(Value::as_f64).collect());
         numbers.ok_or_else(|| format!("{} is missing or no list of numbers", keys[0]))
     };
-    let name = any(&["lensmodel", "lens_model"]).and_then(Value::as_str).ok_or("lensmodel is missing")?;
+    // Files from before 2020 say DISTORTION_OPENCV8.
+    let name =
+        any(&["lensmodel", "lens_model", "distortion_model"]).and_then(Value::as_str).ok_or("lensmodel is missing")?;
+    let name = &name.replace("DISTORTION_", "LENSMODEL_");
     let values = list(&["intrinsics"])?;
     let [fx, fy, cx, cy, ref coefficients @ ..] = *values.as_slice() else {
         return Err(format!("intrinsics has {} numbers, expected fx fy cx cy and coefficients", values.len()));
     };
-    let expected = match name {
+    let expected = match name.as_str() {
         "LENSMODEL_PINHOLE" => 0,
         "LENSMODEL_OPENCV4" => 4,
         "LENSMODEL_OPENCV5" => 5,
@@ -66,7 +72,7 @@ fn model(id: CameraId, root: &Value) -> Result<ImportedCamera, String> {
     })
 }
 
-pub(super) fn files(dir: &Path, rig: &Rig) -> Result<Vec<(String, String)>, CalibError> {
+pub(super) fn files(dir: &Path, rig: &Rig) -> Result<Vec<(String, Vec<u8>)>, CalibError> {
     let file = |camera: &Camera| {
         let i = &camera.intrinsics;
         let coefficients = opencv_coefficients(&i.lens).ok_or_else(|| {
@@ -86,7 +92,7 @@ pub(super) fn files(dir: &Path, rig: &Rig) -> Result<Vec<(String, String)>, Cali
             i.width,
             i.height
         );
-        Ok((format!("{}{ENDING}", camera.id), text))
+        Ok((format!("{}{ENDING}", camera.id), text.into_bytes()))
     };
     rig.cameras.iter().map(file).collect()
 }

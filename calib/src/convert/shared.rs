@@ -2,7 +2,7 @@
 
 use std::path::{Path, PathBuf};
 
-use flyrig_types::{CameraId, Intrinsics, Isometry, Lens};
+use flyrig_types::{Intrinsics, Isometry, Lens};
 use glam::{DMat3, DQuat, DVec2, DVec3};
 
 use crate::error::CalibError;
@@ -51,17 +51,63 @@ pub(super) fn one_file(path: &Path, ending: &str) -> Result<PathBuf, CalibError>
     }
 }
 
-/// Returns the camera of an image path: the folder that contains the image, or the image's name where that folder holds
-/// all images.
-pub(super) fn camera_of_image(image: &str) -> CameraId {
-    let parts: Vec<&str> = image.split(['/', '\\']).filter(|part| !part.is_empty() && *part != ".").collect();
-    let is_common = |folder: &str| folder.to_lowercase().starts_with("image") || folder == "..";
-    let name = match parts.as_slice() {
-        [.., folder, _] if !is_common(folder) => folder,
-        [.., file] => file.rsplit_once('.').map_or(*file, |(stem, _)| stem),
-        [] => "",
+/// Parts of keys that speak of a lens, axes, units or orientation.
+const SPEAKING_PARTS: [&str; 33] = [
+    "distort",
+    "fisheye",
+    "lens",
+    "model",
+    "projection",
+    "omni",
+    "equirect",
+    "latlong",
+    "ftheta",
+    "theta",
+    "shutter",
+    "skew",
+    "mirror",
+    "flip",
+    "axes",
+    "axis",
+    "handed",
+    "coord",
+    "convention",
+    "unit",
+    "orient",
+    "rotat",
+    "extrinsic",
+    "transform",
+    "pose",
+    "crop",
+    "binning",
+    "fov",
+    "rectif",
+    "line_delay",
+    "polynom",
+    "prism",
+    "tilt",
+];
+/// Whole keys that do.
+const SPEAKING_WORDS: [&str; 14] =
+    ["up", "xi", "scale", "alpha", "beta", "gamma", "k1", "k2", "k3", "k4", "k5", "k6", "from_na", "normal_mts_args"];
+
+/// Refuses keys that speak of a lens, axes, units or orientation and are not among the `known` ones of a reader: a default in their
+/// place would be wrong without a word. Other unknown keys are ignored.
+pub(crate) fn refuse_unknown<'a>(keys: impl IntoIterator<Item = &'a str>, known: &[&str]) -> Result<(), String> {
+    let speaks = |key: &str| {
+        let key = key.to_lowercase();
+        let is_statistic = ["error", "residual", "path", "name"].iter().any(|part| key.contains(part));
+        !is_statistic
+            && (key.starts_with("t_")
+                || SPEAKING_WORDS.contains(&key.as_str())
+                || SPEAKING_PARTS.iter().any(|part| key.contains(part)))
     };
-    CameraId::from(name)
+    match keys.into_iter().find(|key| !known.contains(key) && speaks(key)) {
+        Some(key) => Err(format!(
+            "key {key:?} is not understood, and may change lens, axes or units; take it out if it changes none of them"
+        )),
+        None => Ok(()),
+    }
 }
 
 /// Reads a rotation matrix; the error text describes its fault.
@@ -98,11 +144,56 @@ pub(crate) fn opencv_lens(coefficients: &[f64]) -> Result<Lens, String> {
     Ok(Lens::Rational { radial: [c[0], c[1], c[4], c[5], c[6], c[7]], tangential })
 }
 
+/// Returns the fisheye of OpenCV's coefficients k1 to k4 of the angle; a fifth, as some programs write, must be 0.
+pub(crate) fn fisheye_lens(coefficients: &[f64]) -> Result<Lens, String> {
+    match *coefficients {
+        [k1, k2, k3, k4] | [k1, k2, k3, k4, 0.0] => Ok(Lens::Fisheye { coefficients: [k1, k2, k3, k4] }),
+        ref other => Err(format!("{} coefficients of a fisheye, expected 4", other.len())),
+    }
+}
+
+/// Returns the lens of a distortion model by its name in ROS, Kalibr and their kin.
+pub(crate) fn named_lens(model: &str, coefficients: &[f64]) -> Result<Lens, String> {
+    match model.trim().to_lowercase().replace('-', "_").as_str() {
+        "plumb_bob"
+        | "rational_polynomial"
+        | "radtan"
+        | "radial_tangential"
+        | "brown_conrady"
+        | "opencv"
+        | "pinhole"
+        | "perspective" => opencv_lens(coefficients),
+        "equidistant" | "fisheye" | "kannala_brandt" | "kannala_brandt4" | "opencv_fisheye" => {
+            fisheye_lens(coefficients)
+        }
+        "none" if coefficients.iter().all(|value| *value == 0.0) => Ok(Lens::PINHOLE),
+        _ => Err(format!(
+            "model {:?} with {} coefficients is not supported; calibrate with plumb_bob, rational_polynomial or equidistant",
+            model.chars().take(100).collect::<String>(),
+            coefficients.len()
+        )),
+    }
+}
+
 /// Returns OpenCV's coefficients of a lens, 5 or 8; `None` for a fisheye.
 pub(crate) fn opencv_coefficients(lens: &Lens) -> Option<Vec<f64>> {
     let ([k1, k2, k3, k4, k5, k6], [p1, p2]) = lens.rational()?;
     let plain = vec![k1, k2, p1, p2, k3];
     Some(if matches!(lens, Lens::Rational { .. }) { [plain, vec![k4, k5, k6]].concat() } else { plain })
+}
+
+/// Returns focal lengths and principal point of a matrix [fx 0 cx; 0 fy cy; 0 0 1], row by row; a skew of a hundredth of a pixel has no
+/// measurable effect.
+pub(super) fn camera_matrix(rows: &[f64]) -> Result<(DVec2, DVec2), String> {
+    match *rows {
+        [fx, skew, cx, 0.0, fy, cy, 0.0, 0.0, 1.0] if skew.abs() <= 0.01 => {
+            Ok((DVec2::new(fx, fy), DVec2::new(cx, cy)))
+        }
+        [_, skew, _, _, _, _, _, _, _] => Err(format!(
+            "has skew {skew} or an unusual shape, expected [fx 0 cx; 0 fy cy; 0 0 1]; calibrate without skew"
+        )),
+        _ => Err("is not 3x3; export the camera again".to_owned()),
+    }
 }
 
 /// Builds intrinsics of a size in whole pixels; other sizes are left for the check of the camera.

@@ -13,7 +13,8 @@ use crate::stage::FrameStage;
 /// Free buffers kept for later frames.
 const POOLED_FRAMES: usize = 16;
 
-/// Stage that converts frames to `Rgb8` in pooled buffers; frames that are RGB already pass unchanged.
+/// Stage that converts the frames of one camera to `Rgb8` in pooled buffers; frames that are RGB already pass unchanged.
+/// JPEG images that are damaged but decode are found by their data, also against the camera's image before.
 ///
 /// An image that cannot be decoded is a `Corrupt` error, one of unexpected size an `Unsupported` one; each loses its
 /// own frame only.
@@ -30,7 +31,7 @@ impl Decoding {
     /// forged header from allocating more memory than the camera's images need.
     #[must_use]
     pub fn new(size: Option<[u32; 2]>) -> Self {
-        Self { size, pool: BufferPool::new(POOLED_FRAMES), scratch: JpegScratch::default() }
+        Self { size, pool: BufferPool::new(POOLED_FRAMES), scratch: JpegScratch::of_camera() }
     }
 }
 

@@ -38,7 +38,7 @@ impl Default for FolderOptions {
 ///
 /// A frame's number is its file stem where every stem of the chosen cameras is a number, otherwise its position in the
 /// sorted list of all stems. The number divided by the rate gives the time, and the number is the frame's sequence
-/// number. `Corrupt` errors, after which the next frame follows, are: a number that only other cameras have, a damaged
+/// number. Images and masks are upright, as their EXIF orientation says. `Corrupt` errors, after which the next frame follows, are: a number that only other cameras have, a damaged
 /// image, a mask that is missing or of another size, and an image of another size than the camera's first. Mask values
 /// are coverage; a mask without values above 31 is taken for a label map, where everything but 0 is the person. An
 /// all-zero mask is empty.
@@ -94,6 +94,11 @@ impl FolderReplay {
     #[must_use]
     pub fn remaining(&self) -> usize {
         self.shots.len() - self.next
+    }
+
+    /// Leaves out the next frame.
+    pub fn skip(&mut self) {
+        self.next = (self.next + 1).min(self.shots.len());
     }
 
     fn read(&self, shot: &FolderFrame) -> Result<Frame, CaptureError> {
@@ -152,7 +157,7 @@ impl CameraSource for FolderReplay {
 /// `NotFound` when there is no such camera, `Corrupt` when none of its images has a header.
 pub fn folder_image_size(root: &Path, camera: &CameraId) -> Result<(u32, u32), CaptureError> {
     let pictures = camera_images(root, camera)?;
-    pictures.values().find_map(|path| image::image_dimensions(path).ok()).ok_or_else(|| {
+    pictures.values().find_map(|path| image_file::read_dimensions(path).ok()).ok_or_else(|| {
         CaptureError::new(
             camera,
             CaptureErrorKind::Corrupt,

@@ -27,6 +27,7 @@
 mod blocking;
 mod camera_options;
 mod clock;
+mod container;
 mod decoding;
 mod device_settings;
 mod encoding;
@@ -55,6 +56,7 @@ pub use device_settings::{DeviceOptions, DeviceSettings};
 pub use encoding::JpegEncoding;
 pub use error::{CaptureError, CaptureErrorKind};
 pub use folder::{FolderOptions, FolderReplay, folder_image_size};
+pub use image_file::read_image;
 pub use nokhwa_camera::{NokhwaCamera, NokhwaDevice, NokhwaOptions, nokhwa_cameras};
 pub use pool::BufferPool;
 pub use queue::{LatestQueue, PopError};
@@ -66,7 +68,7 @@ pub use recording::{
 pub use rgb::{to_rgb8, to_rgb8_into};
 pub use source::{CameraSource, NetworkHealth, SourceHealth};
 pub use stage::FrameStage;
-pub use threads::{CameraStats, CaptureThreads, Pacing, SourceOpener, ThreadsConfig};
+pub use threads::{CameraStats, CaptureThreads, FrameRate, Pacing, SourceOpener, ThreadsConfig};
 #[cfg(target_os = "linux")]
 pub use v4l2::{BusPlan, CameraNode, CameraReport, FormatReport, UsbPlace, V4l2Camera, camera_reports, plan_buses};
 pub use video::{VideoOptions, VideoReplay};

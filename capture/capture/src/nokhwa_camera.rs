@@ -234,13 +234,11 @@ impl BlockingCamera for OpenCamera {
     }
 
     fn read(&mut self, bytes: &mut Vec<u8>) -> Result<DriverImage, CaptureError> {
+        let before = wall_offset_nanos();
         let buffer = self.0.frame().map_err(|error| explain(&error))?;
         let arrival_nanos = monotonic_nanos();
-        let stamp_nanos = buffer.capture_timestamp().and_then(|taken| {
-            let now = SystemTime::now().duration_since(SystemTime::UNIX_EPOCH).ok()?;
-            let age = i128::try_from(now.as_nanos()).ok()? - i128::try_from(taken.as_nanos()).ok()?;
-            i64::try_from(i128::from(arrival_nanos) - age).ok()
-        });
+        let stamp_nanos =
+            buffer.capture_timestamp().and_then(|taken| steady_nanos(taken, [before, wall_offset_nanos()]));
         let resolution = buffer.resolution();
         let format = buffer.source_frame_format();
         let Some((.., format)) = FORMATS.iter().find(|(of, ..)| *of == format) else {
@@ -249,6 +247,24 @@ impl BlockingCamera for OpenCamera {
         let size = cut(*format, (resolution.width(), resolution.height()), buffer.buffer(), bytes)?;
         Ok(DriverImage { size, format: *format, stamp_nanos, arrival_nanos })
     }
+}
+
+/// Largest change of the wall clock against the monotonic one during a read that is not a step, nanoseconds: a busy machine may pause
+/// between the readings of both.
+const SAME_CLOCK: u64 = 20_000_000;
+
+/// Returns the wall clock minus the monotonic clock, nanoseconds; `None` before 1970.
+fn wall_offset_nanos() -> Option<i64> {
+    let now = SystemTime::now().duration_since(SystemTime::UNIX_EPOCH).ok()?;
+    i64::try_from(now.as_nanos()).ok()?.checked_sub(monotonic_nanos())
+}
+
+/// Converts a time of the wall clock to the monotonic one, with their difference before and after the read that gave it. `None` where the
+/// wall clock was set in between: then the time may be of either setting.
+fn steady_nanos(taken: Duration, [before, after]: [Option<i64>; 2]) -> Option<i64> {
+    let (before, after) = (before?, after?);
+    let taken = i64::try_from(taken.as_nanos()).ok()?;
+    (before.abs_diff(after) <= SAME_CLOCK).then(|| taken.saturating_sub(after))
 }
 
 /// Copies the image without trailing bytes, since nokhwa may return the driver's whole buffer. Returns its size.
@@ -278,6 +294,24 @@ mod tests {
     fn options(device: &str) -> NokhwaOptions {
         let (width, height, fps) = (640, 360, 30.0);
         NokhwaOptions { device: device.into(), width, height, fps, format: FormatChoice::Auto, lag_secs: 0.0 }
+    }
+
+    #[test]
+    fn a_wall_clock_that_is_set_during_a_read_gives_no_stamp() {
+        const SECOND: i64 = 1_000_000_000;
+        let (monotonic, offset) = (500 * SECOND, 1_700_000_000 * SECOND);
+        for step in [SECOND / 10, SECOND / 2, 10 * SECOND, 3600 * SECOND].into_iter().flat_map(|step| [step, -step]) {
+            // Set before the driver's stamp, or after it.
+            for taken in [monotonic + offset, monotonic + offset + step] {
+                let taken = Duration::from_nanos(taken.unsigned_abs());
+                assert_eq!(steady_nanos(taken, [Some(offset), Some(offset + step)]), None, "{step}");
+            }
+            // Set at another time.
+            let taken = Duration::from_nanos((monotonic + offset + step).unsigned_abs());
+            assert_eq!(steady_nanos(taken, [Some(offset + step); 2]), Some(monotonic), "{step}");
+        }
+        assert_eq!(steady_nanos(Duration::MAX, [Some(0); 2]), None);
+        assert_eq!(steady_nanos(Duration::ZERO, [None, Some(0)]), None);
     }
 
     #[test]

@@ -17,10 +17,21 @@ pub struct SourceHealth {
     pub silences: u64,
     /// Implausible timestamps that were replaced.
     pub stamps_replaced: u64,
-    /// Format, size and rate in use, as text; empty where the source does not report them.
+    /// Format, size and rate in use, as text such as `YUYV 640x360 at 30.00`, and notes after it; empty where the source does not report
+    /// them.
     pub mode: Arc<str>,
     /// Network statistics of a camera on another computer.
     pub network: Option<NetworkHealth>,
+}
+
+impl SourceHealth {
+    /// Returns the frame rate of the mode, frames per second; `None` where the source does not report it.
+    #[must_use]
+    pub fn mode_fps(&self) -> Option<f64> {
+        let (_, rate) = self.mode.split_once(" at ")?;
+        let end = rate.find(|c: char| !c.is_ascii_digit() && c != '.').unwrap_or(rate.len());
+        rate[..end].parse().ok().filter(|fps: &f64| fps.is_finite() && *fps > 0.0)
+    }
 }
 
 /// Network statistics of a camera on another computer; counts since the subscription began.
@@ -120,3 +131,25 @@ macro_rules! forward_source {
     };
 }
 pub(crate) use forward_source;
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn the_rate_of_a_mode_is_the_number_after_at() {
+        for (mode, fps) in [
+            ("YUYV 640x360 at 30.00", Some(30.0)),
+            ("MJPEG 640x480 at 25 through nokhwa, stamped at arrival less half a period", Some(25.0)),
+            ("96x96 at 0.50", Some(0.5)),
+            ("", None),
+            ("Mjpeg 640x480", None),
+            ("x at rest", None),
+            ("x at 0", None),
+            ("x at 1.2.3", None),
+        ] {
+            let health = SourceHealth { mode: mode.into(), ..SourceHealth::default() };
+            assert_eq!(health.mode_fps(), fps, "{mode}");
+        }
+    }
+}

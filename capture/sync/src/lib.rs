@@ -7,6 +7,9 @@ mod clocks;
 mod clocks_tests;
 mod hull;
 mod lags;
+mod overdue;
+#[cfg(test)]
+mod overdue_tests;
 mod settings;
 mod silhouette_lags;
 mod sync;

@@ -8,6 +8,7 @@ use std::{
 use flyrig_types::{CameraId, Frame, FrameSet, SetKind};
 use serde::{Deserialize, Serialize};
 
+use crate::overdue::Arrivals;
 use crate::settings::SyncSettings;
 
 /// Most frames of a camera that wait for a frame set: a runaway clock must not exhaust the memory.
@@ -62,7 +63,8 @@ pub struct SyncCounts {
 /// Synchroniser that groups the frames nearest in time to those of a master camera.
 ///
 /// A frame set is emitted as soon as nothing nearer can come (every camera that is not silent has delivered a frame at
-/// or past its time) or when it has waited [`SyncSettings::max_wait_nanos`]. A frame that claims to be farther than
+/// or past its time) or when it has waited [`SyncSettings::max_wait_nanos`]; live, also once its missing frames would
+/// have arrived ([`Self::give_up`]). A frame that claims to be farther than
 /// that ahead of all others is held back until a second one confirms it: a single wrong timestamp must not move the
 /// time of the whole rig. Time is the frames' own: identical frames pushed in the same order give identical frame sets.
 /// A frame is used at most once, the times of frame sets increase strictly, and a frame set that follows another
@@ -93,10 +95,10 @@ pub struct SyncCounts {
 /// ```
 #[derive(Debug)]
 pub struct Synchronizer {
-    cameras: Vec<Camera>,
+    pub(crate) cameras: Vec<Camera>,
     /// Slots in the order in which their clocks lead: the master, then the rig's order.
     clock_order: Vec<usize>,
-    window: u64,
+    pub(crate) window: u64,
     /// Whether the window is half of the master's period.
     follows_period: bool,
     max_wait: u64,
@@ -112,31 +114,33 @@ pub struct Synchronizer {
 }
 
 #[derive(Debug)]
-struct Camera {
-    id: CameraId,
+pub(crate) struct Camera {
+    pub id: CameraId,
     /// Time offset, subtracted from its timestamps, nanoseconds.
-    lag: i64,
+    pub lag: i64,
     /// Waiting frames, by time.
     pending: BTreeMap<i64, Arc<Frame>>,
     /// Frame far ahead of all others, not confirmed yet.
     suspect: Option<Arc<Frame>>,
     /// Time of the frame pushed last. Not the largest: one absurd time must not persist.
-    latest: Option<i64>,
+    pub latest: Option<i64>,
     /// Interval between the previous frame and that one, nanoseconds.
     interval: Option<u64>,
     /// Recent intervals, newest last.
-    intervals: VecDeque<u64>,
+    pub intervals: VecDeque<u64>,
     /// Per other camera, the frames since this one's last instant.
     missed: Vec<u64>,
     /// Time of the last frame that joined a frame set.
     used: Option<i64>,
     /// Distance of that frame from the frame set's time, and the slot whose clock the frame set followed.
-    offset: Option<(usize, i64)>,
+    pub offset: Option<(usize, i64)>,
+    /// Latencies of its frames, where they are live.
+    pub arrivals: Arrivals,
 }
 
 impl Camera {
     /// Returns the frame period: the median of recent intervals, since a lost frame doubles one of them.
-    fn period(&self) -> Option<u64> {
+    pub fn period(&self) -> Option<u64> {
         let mut sorted = [0; INTERVALS];
         let sorted = &mut sorted[..self.intervals.len()];
         sorted.iter_mut().zip(&self.intervals).for_each(|(to, from)| *to = *from);
@@ -145,7 +149,7 @@ impl Camera {
     }
 
     /// Returns the time of the waiting frame nearest to a time.
-    fn nearest(&self, nanos: i64) -> Option<i64> {
+    pub fn nearest(&self, nanos: i64) -> Option<i64> {
         let before = self.pending.range(..=nanos).next_back().map(|(time, _)| *time);
         let after = self.pending.range(nanos..).next().map(|(time, _)| *time);
         before.into_iter().chain(after).min_by_key(|time| time.abs_diff(nanos))
@@ -188,6 +192,7 @@ impl Synchronizer {
                     missed: vec![0; cameras.len()],
                     used: None,
                     offset: None,
+                    arrivals: Arrivals::default(),
                 })
                 .collect(),
             clock_order,
@@ -299,18 +304,27 @@ impl Synchronizer {
     fn drain(&mut self, flush: bool) -> Vec<FrameSet> {
         let mut sets = Vec::new();
         while let Some((clock, nanos)) = self.next_tick() {
-            // Just after a change of clock the instant of the last set is met again.
-            let again = self.last_set.is_some_and(|(last, by)| by != clock && nanos.abs_diff(last) <= self.window);
-            if again {
-                self.cameras[clock].pending.remove(&nanos);
-                self.counts.dropped_frames[clock].superseded += 1;
-            } else if flush || self.is_certain(nanos) {
-                sets.push(self.emit(clock, nanos));
-            } else {
+            if !(flush || self.is_again(clock, nanos) || self.is_certain(nanos)) {
                 break;
             }
+            sets.extend(self.take_tick(clock, nanos));
         }
         sets
+    }
+
+    /// Returns whether the instant of the last set is met again, as just after a change of clock.
+    fn is_again(&self, clock: usize, nanos: i64) -> bool {
+        self.last_set.is_some_and(|(last, by)| by != clock && nanos.abs_diff(last) <= self.window)
+    }
+
+    /// Emits the frame set of an instant, or drops the frame of one that is met again.
+    pub(crate) fn take_tick(&mut self, clock: usize, nanos: i64) -> Option<FrameSet> {
+        if self.is_again(clock, nanos) {
+            self.cameras[clock].pending.remove(&nanos);
+            self.counts.dropped_frames[clock].superseded += 1;
+            return None;
+        }
+        Some(self.emit(clock, nanos))
     }
 
     /// Returns the time of the newest frame.
@@ -327,7 +341,7 @@ impl Synchronizer {
     }
 
     /// Returns the next frame set's time and the camera that sets it.
-    fn next_tick(&self) -> Option<(usize, i64)> {
+    pub(crate) fn next_tick(&self) -> Option<(usize, i64)> {
         for &slot in &self.clock_order {
             let after_last = |nanos: &&i64| self.last_set.is_none_or(|(last, _)| **nanos > last);
             if let Some(nanos) = self.cameras[slot].pending.keys().find(after_last) {
@@ -342,12 +356,15 @@ impl Synchronizer {
 
     fn is_certain(&self, nanos: i64) -> bool {
         let waited = self.now().is_some_and(|now| now > nanos && now.abs_diff(nanos) >= self.max_wait);
-        waited
-            || self.cameras.iter().enumerate().all(|(slot, camera)| {
-                camera.latest.is_some_and(|latest| latest >= nanos)
-                    || camera.pending.contains_key(&nanos)
-                    || self.is_silent(slot)
-            })
+        waited || (0..self.cameras.len()).all(|slot| self.has_passed(slot, nanos))
+    }
+
+    /// Returns whether no frame of a camera at or before an instant is awaited.
+    pub(crate) fn has_passed(&self, slot: usize, nanos: i64) -> bool {
+        let camera = &self.cameras[slot];
+        camera.latest.is_some_and(|latest| latest >= nanos)
+            || camera.pending.contains_key(&nanos)
+            || self.is_silent(slot)
     }
 
     fn emit(&mut self, clock: usize, nanos: i64) -> FrameSet {
@@ -388,4 +405,4 @@ impl Synchronizer {
 
 #[cfg(test)]
 #[path = "sync_tests.rs"]
-mod tests;
+pub(crate) mod tests;

@@ -66,6 +66,9 @@ pub enum FusionError {
     /// Person that cannot be sent as a stream.
     #[error(transparent)]
     Stream(#[from] flyrig_stream::StreamError),
+    /// View that panicked while it was drawn.
+    #[error("drawing it panicked: {0}; this is a fault of flyrig, please report it with the log")]
+    View(String),
     /// Thread that the system did not start.
     #[error(
         "cannot start the thread '{name}': {source}; end other programs, or raise the limit of processes (ulimit -u)"

@@ -62,8 +62,8 @@ pub use settings::{
     SessionSettings, Solver, TrackingSettings,
 };
 pub use subject::{
-    Observed, PROCESSOR_STAGE, PersonFrame, PersonMemory, Remedy, Subject, TrackState, TrackWatch, person_gaussians,
-    person_surface, stream_joints,
+    Observed, PROCESSOR_STAGE, PersonFrame, PersonMemory, Remedy, Subject, TrackState, TrackWatch, Upright,
+    person_gaussians, person_surface, stream_joints,
 };
 
 pub use flyrig_renderer::Splat;

@@ -3,6 +3,7 @@
 mod metrics_text;
 mod monitor;
 mod page_server;
+mod rate_watch;
 mod table;
 
 pub use monitor::{Arrivals, Monitor, ended_by_itself};

@@ -17,10 +17,19 @@ use crate::table;
 /// Media type of the text.
 pub const KIND: &str = "application/openmetrics-text; version=1.0.0; charset=utf-8";
 
-/// Formats a snapshot, and the state of a recording where there is one, as OpenMetrics text.
-pub fn prometheus(health: &Health, recorded: Option<&Recorded>) -> String {
+/// Days until the next key and the rig's certificate end, where they are known.
+#[derive(Debug, Clone, Copy, Default, PartialEq)]
+pub struct KeyDays {
+    /// Days until the next of the keys ends.
+    pub next_key: Option<f64>,
+    /// Days until the rig's certificate ends; negative afterwards.
+    pub certificate: Option<f64>,
+}
+
+/// Formats a snapshot, the state of a recording where there is one, and the ends of keys as OpenMetrics text.
+pub fn prometheus(health: &Health, recorded: Option<&Recorded>, keys: KeyDays) -> String {
     let mut registry = Registry::with_prefix("flyrig");
-    registry.register_collector(Box::new(Snapshot { health: health.clone(), recorded: recorded.cloned() }));
+    registry.register_collector(Box::new(Snapshot { health: health.clone(), recorded: recorded.cloned(), keys }));
     let mut page = String::new();
     match text::encode(&mut page, &registry) {
         Ok(()) => page,
@@ -34,6 +43,7 @@ pub fn prometheus(health: &Health, recorded: Option<&Recorded>) -> String {
 struct Snapshot {
     health: Health,
     recorded: Option<Recorded>,
+    keys: KeyDays,
 }
 
 /// Name and help of a family of counters, and its value for a camera that has one.
@@ -78,10 +88,13 @@ const CAMERA_COUNTERS: [Counter; 12] = [
     }),
 ];
 
-const CAMERA_GAUGES: [Gauge; 9] = [
+const CAMERA_GAUGES: [Gauge; 10] = [
     ("quiet_seconds", "Since the last frame.", |c| c.quiet_s),
     ("interval_seconds", "Mean time between captures.", |c| {
         (c.is_up() && c.interval_ms > 0.0).then_some(c.interval_ms / 1e3)
+    }),
+    ("rate_ratio", "Rate of captures over that of the camera's mode.", |c| {
+        c.stats.rate.filter(|_| c.is_up()).map(|rate| rate.ratio())
     }),
     ("moved_pixels", "How far its image lies from where it was calibrated; 0: it was not moved.", |c| match c.watch {
         WatchState::Unknown => None,
@@ -144,6 +157,12 @@ impl Collector for Snapshot {
         if let Some(mib) = health.resident_mib {
             page.gauge("resident_bytes", "Resident memory.", (mib * 1024.0 * 1024.0) as u64)?;
         }
+        if let Some(days) = self.keys.next_key {
+            page.gauge("key_end_days", "Days until the next key ends.", days)?;
+        }
+        if let Some(days) = self.keys.certificate {
+            page.gauge("certificate_end_days", "Days until the rig's certificate ends.", days)?;
+        }
         let Some(recorded) = &self.recorded else { return Ok(()) };
         page.counter("recording_frames", "Frames in the recording.", recorded.frames)?;
         page.counter("recording_bytes", "Their bytes.", recorded.bytes)?;
@@ -204,12 +223,13 @@ mod tests {
 
     #[test]
     fn every_line_of_the_metrics_is_well_formed() {
-        let text = prometheus(&health(), None);
+        let text = prometheus(&health(), None, KeyDays { next_key: Some(6.5), certificate: Some(3649.0) });
         for line in [
             "flyrig_frames_total{camera=\"le\\\"ft\"} 900",
             "flyrig_camera_errors_total{camera=\"le\\\"ft\",kind=\"Corrupt\"} 2",
             "flyrig_sets_total{kind=\"partial\"} 10",
             "flyrig_lateness_seconds{camera=\"le\\\"ft\"} 0.012",
+            "flyrig_rate_ratio{camera=\"le\\\"ft\"} 0.5",
             "flyrig_clock_drift_ppm{camera=\"le\\\"ft\"} -12.5",
             "flyrig_stage_seconds{stage=\"draw\",quantile=\"0.95\"} 0.004",
             "flyrig_resident_bytes 2097152",
@@ -221,6 +241,8 @@ mod tests {
             "flyrig_network_lost_total{camera=\"le\\\"ft\"} 8",
             "flyrig_host_clock_offset_seconds{camera=\"le\\\"ft\"} -1.5",
             "flyrig_host_clock_drift_ppm{camera=\"le\\\"ft\"} 2.5",
+            "flyrig_key_end_days 6.5",
+            "flyrig_certificate_end_days 3649.0",
         ] {
             assert!(text.lines().any(|found| found == line), "{line} in\n{text}");
         }
@@ -245,7 +267,7 @@ mod tests {
         let problem = Some("disk full".to_owned());
         let recorded =
             Recorded { frames: 7, bytes: 2_000_000, files: 2, free_bytes: Some(9), problem, ..Recorded::default() };
-        let text = prometheus(&health, Some(&recorded));
+        let text = prometheus(&health, Some(&recorded), KeyDays::default());
         for line in [
             "flyrig_thread_restarts_total{thread=\"camera le\\\"ft\"} 2",
             "flyrig_thread_restarts_total{thread=\"stage le\\\"ft\"} 0",
@@ -265,11 +287,14 @@ mod tests {
     #[test]
     fn a_camera_without_frames_is_down_and_tells_nothing_old() {
         let mut health = health();
-        let has = |health: &Health, start: &str| prometheus(health, None).lines().any(|line| line.starts_with(start));
+        let has = |health: &Health, start: &str| {
+            prometheus(health, None, KeyDays::default()).lines().any(|line| line.starts_with(start))
+        };
         assert!(has(&health, "flyrig_camera_up{camera=\"le\\\"ft\"} 1"));
         for quiet_s in [Some(60.0), None] {
             health.cameras[0].quiet_s = quiet_s;
             assert!(has(&health, "flyrig_camera_up{camera=\"le\\\"ft\"} 0"));
+            assert!(!has(&health, "flyrig_rate_ratio{"));
             assert!(!has(&health, "flyrig_lateness_seconds{") && !has(&health, "flyrig_interval_seconds{"));
         }
         // A status of another computer may hold any number.
@@ -282,7 +307,7 @@ mod tests {
     fn no_name_of_a_camera_breaks_the_page() {
         let mut health = health();
         health.cameras[0].stats.camera = "a\\b\"} 1\nflyrig_frames_total 7\r".into();
-        let text = prometheus(&health, None);
+        let text = prometheus(&health, None, KeyDays::default());
         assert!(
             text.contains("flyrig_frames_total{camera=\"a\\\\b\\\"} 1\\nflyrig_frames_total 7\r\"} 900\n"),
             "{text}"

@@ -5,22 +5,31 @@
 
 use std::{
     collections::{BTreeMap, BTreeSet},
+    path::{Path, PathBuf},
     sync::mpsc::{RecvTimeoutError, sync_channel},
     thread::Builder,
-    time::{Duration, Instant},
+    time::{Duration, Instant, SystemTime},
 };
 
 use anyhow::{Result, anyhow};
+use flyrig_access::KeyEnds;
 use flyrig_calib::WatchState;
 use flyrig_capture::{CameraStats, CaptureThreads, Recorded};
 use flyrig_fusion::{CameraHealth, Health, STUCK_AFTER, resident_mib};
 use flyrig_gpu::GpuContext;
 use flyrig_types::CameraId;
 
-use crate::{metrics_text, page_server::PageServer, table};
+use crate::{
+    metrics_text::{self, KeyDays},
+    page_server::PageServer,
+    rate_watch::RateWatch,
+    table,
+};
 
 /// Time from one report to the next.
 const EVERY: Duration = Duration::from_secs(1);
+/// Time from one look at the ends of keys to the next.
+const KEYS_EVERY: Duration = Duration::from_secs(60);
 
 /// Reporter of a command's health, from its start to its end. Every loop of the command calls [`Self::report`].
 ///
@@ -48,8 +57,13 @@ pub struct Monitor {
     logged: BTreeMap<String, (u64, bool)>,
     /// Cameras that were reported as silent.
     silent: BTreeSet<CameraId>,
+    rates: RateWatch,
     /// Status that the service manager has.
     status: String,
+    /// Folder of the rig's keys; empty without keys.
+    keys: PathBuf,
+    /// Time of the last look at the ends of keys, and what it found.
+    key_days: Option<(Instant, KeyDays)>,
 }
 
 impl Monitor {
@@ -66,10 +80,17 @@ impl Monitor {
         if let Some(metrics) = &metrics {
             eprintln!("metrics at http://{}/metrics", metrics.address());
             let health = Health { resident_mib: resident_mib(), ..Health::default() };
-            metrics.publish(metrics_text::prometheus(&health, None));
+            metrics.publish(metrics_text::prometheus(&health, None, KeyDays::default()));
         }
-        let (reported, watchdog, logged, silent) = Default::default();
-        Ok(Self { metrics, show_table, reported, watchdog, logged, silent, status: String::new() })
+        let (reported, watchdog, logged, silent, rates, status, keys, key_days) = Default::default();
+        Ok(Self { metrics, show_table, reported, watchdog, logged, silent, rates, status, keys, key_days })
+    }
+
+    /// Shows when the keys in this folder end, if it is not empty.
+    #[must_use]
+    pub fn with_keys(mut self, folder: &Path) -> Self {
+        folder.clone_into(&mut self.keys);
+        self
     }
 
     /// Tells the service manager that the service is up. The watchdog is in force from here on.
@@ -108,12 +129,28 @@ impl Monitor {
             notify(&format!("STATUS={status}"));
             self.status = status;
         }
+        let keys = self.key_days();
         if let Some(metrics) = &self.metrics {
-            metrics.publish(metrics_text::prometheus(&health, recorded.as_ref()));
+            metrics.publish(metrics_text::prometheus(&health, recorded.as_ref(), keys));
         }
         if self.show_table {
             // Clears the terminal first.
             eprint!("\x1b[2J\x1b[H{}", table::table(&health, recorded.as_ref()));
+        }
+    }
+
+    /// Returns the days until keys end, at most a minute old.
+    fn key_days(&mut self) -> KeyDays {
+        if self.metrics.is_none() || self.keys.as_os_str().is_empty() {
+            return KeyDays::default();
+        }
+        match self.key_days {
+            Some((at, days)) if at.elapsed() < KEYS_EVERY => days,
+            _ => {
+                let days = key_days(&self.keys, SystemTime::now());
+                self.key_days = Some((Instant::now(), days));
+                days
+            }
         }
     }
 
@@ -128,6 +165,9 @@ impl Monitor {
                 None if self.silent.remove(name) => tracing::info!("camera {name}: frames come again"),
                 _ => {}
             }
+        }
+        for change in self.rates.changes(health) {
+            change.log();
         }
         for (thread, restarts) in table::thread_restarts(health) {
             let logged = self.logged.entry(thread.clone()).or_default();
@@ -157,6 +197,18 @@ impl Drop for Monitor {
     fn drop(&mut self) {
         notify("STOPPING=1");
     }
+}
+
+/// Returns the days from `now` until keys end; unknown where the folder cannot be read, which the gate reports.
+fn key_days(folder: &Path, now: SystemTime) -> KeyDays {
+    let days = |end: SystemTime| match end.duration_since(now) {
+        Ok(left) => left.as_secs_f64() / 86_400.0,
+        Err(past) => -past.duration().as_secs_f64() / 86_400.0,
+    };
+    KeyEnds::read(folder, now).map_or(KeyDays::default(), |ends| KeyDays {
+        next_key: ends.next_key.map(|(_, end)| days(end)),
+        certificate: Some(days(ends.certificate)),
+    })
 }
 
 /// Decision whether the service manager's watchdog is fed: by progress, not by time.
@@ -282,6 +334,7 @@ impl Arrivals {
 
 #[cfg(test)]
 mod tests {
+    use flyrig_access::{Ring, Role};
     use flyrig_capture::{CaptureError, CaptureErrorKind};
 
     use super::*;
@@ -300,6 +353,23 @@ mod tests {
         watchdog.stepped = true;
         health.stuck.push("stage left".to_owned());
         assert_eq!(watchdog.assess(&health), (false, "stuck: stage left".to_owned()));
+    }
+
+    #[test]
+    fn days_until_keys_end_are_those_of_the_next_key_and_of_the_certificate() {
+        let folder = tempfile::tempdir().unwrap();
+        let keys = folder.path().join("keys");
+        assert_eq!(key_days(&keys, SystemTime::now()), KeyDays::default());
+        let mut ring = Ring::create(&keys, "studio", &["rig.local".to_owned()], 7450).unwrap();
+        ring.add("long", Role::Viewer, 300).unwrap();
+        ring.add("desk", Role::Viewer, 40).unwrap();
+        let at = |days: u64| key_days(&keys, SystemTime::now() + Duration::from_secs(days * 86_400));
+        let near = |found: Option<f64>, days: f64| found.is_some_and(|found| (found - days).abs() < 0.01);
+        assert!(near(at(10).next_key, 30.0) && near(at(10).certificate, 3640.0), "{:?}", at(10));
+        assert!(near(at(50).next_key, 250.0), "{:?}", at(50));
+        assert!(at(301).next_key.is_none() && near(at(3651).certificate, -1.0), "{:?}", at(3651));
+        let mut monitor = Monitor::start("127.0.0.1:0", false).unwrap().with_keys(&keys);
+        assert!(near(monitor.key_days().next_key, 40.0), "{:?}", monitor.key_days());
     }
 
     #[test]

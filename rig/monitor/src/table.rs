@@ -57,6 +57,9 @@ pub fn table(health: &Health, recorded: Option<&Recorded>) -> String {
         if let Some(seconds) = silence_s(camera) {
             let _ = write!(mode, "  silent for {seconds:.0} s");
         }
+        if let Some(rate) = stats.rate.filter(|rate| rate.is_slow() && camera.is_up()) {
+            let _ = write!(mode, "  slow: {:.1} of {:.1} per second", rate.measured_fps, rate.mode_fps);
+        }
         if let WatchState::Moved(motion) = camera.watch {
             let _ = write!(mode, "  moved: {:.1} px", motion.pixels);
         }
@@ -113,7 +116,7 @@ pub mod tests {
     use std::collections::BTreeMap;
 
     use flyrig_calib::CameraMotion;
-    use flyrig_capture::{CameraStats, CaptureErrorKind, SourceHealth};
+    use flyrig_capture::{CameraStats, CaptureErrorKind, FrameRate, SourceHealth};
     use flyrig_fusion::StageSummary;
     use flyrig_sync::ClockState;
 
@@ -139,6 +142,7 @@ pub mod tests {
                 mode: "YUYV 640x360 at 30.00".into(),
                 ..Default::default()
             },
+            rate: Some(FrameRate { mode_fps: 30.0, measured_fps: 15.0 }),
             running: true,
             restarts: 0,
             stage_restarts: 0,
@@ -201,7 +205,7 @@ pub mod tests {
         let cells: Vec<&str> = row.split_whitespace().collect();
         assert_eq!(cells[..9], ["le\"ft", "900", "7", "3", "5", "2", "1", "0.40", "12.0"]);
         assert!(
-            row.ends_with("  YUYV 640x360 at 30.00  moved: 9.5 px  network: 8 lost, clock -1.5000 s +2.5 ppm"),
+            row.ends_with("  YUYV 640x360 at 30.00  slow: 15.0 of 30.0 per second  moved: 9.5 px  network: 8 lost, clock -1.5000 s +2.5 ppm"),
             "{row}"
         );
         let last: Vec<&str> = table.lines().skip(2).collect();

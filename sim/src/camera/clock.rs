@@ -54,7 +54,7 @@ struct Progress {
 impl RealClock {
     pub(crate) fn new(cameras: usize, fps: f64) -> Self {
         Self {
-            interval: Duration::from_secs_f64(1.0 / fps),
+            interval: flyrig_types::saturating_secs(1.0 / fps),
             state: Mutex::new(State {
                 origin: None,
                 index: None,
@@ -74,7 +74,7 @@ impl RealClock {
     /// Returns the next instant for the camera in `slot`: the one that the others are taking if it lacks that,
     /// otherwise a new one once all have delivered the last and it is due. `None` when that is not within `timeout`.
     pub(crate) fn next(&self, slot: usize, timeout: Duration) -> Option<u64> {
-        let deadline = Instant::now() + timeout;
+        let deadline = flyrig_types::deadline_after(timeout);
         let mut state = self.lock();
         state.cameras[slot].away = false;
         // To have taken it is not enough: a camera that is still waiting for its image would fall behind the others.
@@ -97,7 +97,8 @@ impl RealClock {
                     state.begin(current, current - next, now);
                     continue;
                 }
-                until = until.min(rested.max(origin + self.interval.mul_f64(next as f64)));
+                let due = origin + flyrig_types::saturating_secs(self.interval.as_secs_f64() * next as f64);
+                until = until.min(rested.max(due));
             }
             if now >= deadline {
                 return None;

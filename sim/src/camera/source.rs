@@ -5,7 +5,7 @@ use std::{
     time::Duration,
 };
 
-use flyrig_capture::{CameraSource, CaptureError, CaptureErrorKind};
+use flyrig_capture::{CameraSource, CaptureError, CaptureErrorKind, SourceHealth};
 use flyrig_types::{CameraId, Frame, Image, lock};
 
 use crate::camera::clock::RealClock;
@@ -33,6 +33,7 @@ pub struct SimSource {
     frames: Option<u64>,
     /// Frames per second.
     fps: f64,
+    health: SourceHealth,
 }
 
 /// Consecutive lost frames after which a call returns, so that it never blocks for ever.
@@ -44,6 +45,7 @@ const MOST_DROPPED: u32 = 64;
 pub fn sources(simulator: &Arc<Mutex<Simulator>>, time: SimTime) -> Vec<SimSource> {
     let guard = lock(simulator);
     let (frames, fps) = (guard.config().frames, guard.config().fps);
+    let mode: Arc<str> = format!("{}x{} at {fps:.2}", guard.config().width, guard.config().height).into();
     let clock = match time {
         SimTime::Exact => None,
         SimTime::Real => Some(Arc::new(RealClock::new(guard.rig().cameras.len(), guard.config().fps))),
@@ -62,6 +64,7 @@ pub fn sources(simulator: &Arc<Mutex<Simulator>>, time: SimTime) -> Vec<SimSourc
             disconnected: false,
             frames,
             fps,
+            health: SourceHealth { mode: Arc::clone(&mode), ..SourceHealth::default() },
         })
         .collect()
 }
@@ -103,6 +106,10 @@ impl CameraSource for SimSource {
 
     fn next_nanos(&self) -> Option<i64> {
         Some((self.next_index as f64 * 1e9 / self.fps) as i64)
+    }
+
+    fn health(&self) -> SourceHealth {
+        self.health.clone()
     }
 }
 

@@ -3,7 +3,7 @@
 use std::f64::consts::TAU;
 use std::path::{Path, PathBuf};
 
-use flyrig_body::{MotionClip, RetargetOptions, Skeleton, load_bvh, load_gltf};
+use flyrig_body::{MotionClip, RetargetOptions, Skeleton, load_bvh, load_gltf_motion};
 use flyrig_types::{Pose, PoseTrack};
 use glam::DVec3;
 use rand::{RngExt, SeedableRng, rngs::StdRng};
@@ -68,7 +68,7 @@ fn track_around_origin(config: &SimConfig, person: &Person) -> Result<PoseTrack,
         }
         MotionKind::Gltf => {
             let path = existing(motion.gltf.as_deref().unwrap_or(Path::new("motion.gltf")))?;
-            recorded(&load_gltf(&path)?.motion()?, skeleton, &motion)
+            recorded(&load_gltf_motion(&path)?, skeleton, &motion)
         }
         kind => {
             let puppet = Puppet::new(skeleton, &person.clothed)?;

@@ -57,7 +57,7 @@ fn main() -> ExitCode {
     }
     let mut clean = true;
     for target in TARGETS.iter().filter(|target| wanted.is_empty() || wanted.iter().any(|name| *name == target.name)) {
-        match run(target, &corpus.join(target.name), Duration::from_secs_f64(minutes * 60.0), seed) {
+        match run(target, &corpus.join(target.name), flyrig_types::saturating_secs(minutes * 60.0), seed) {
             Ok(line) => println!("fuzz {}: {line}", target.name),
             Err(problem) => {
                 println!("fuzz {}: FAILED: {problem}", target.name);

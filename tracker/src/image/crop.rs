@@ -1,6 +1,7 @@
 //! Rotated square crops of an image, the input of landmark networks.
 
-use glam::DVec2;
+use flyrig_types::Camera;
+use glam::{DVec2, DVec3};
 
 use crate::image::pixels::Rgb;
 use crate::landmarks::keypoints::{
@@ -11,6 +12,8 @@ use crate::network::output::{NET_SIDE, NetOutput};
 /// Half side of a crop over the distance of the farthest landmark: the network was trained with a quarter more than the
 /// person.
 const MARGIN: f64 = 1.25;
+/// Sine of the angle between view and vertical below which a camera looks from above or below.
+const FROM_ABOVE: f64 = 0.3;
 
 /// Square of an image, rotated so that the person stands upright in it.
 #[derive(Debug, Clone, Copy, PartialEq)]
@@ -25,6 +28,7 @@ pub(crate) struct Crop {
 
 impl Crop {
     /// Returns an upright square.
+    #[cfg(test)]
     pub fn upright(center: DVec2, side: f64) -> Self {
         Self { center, side, turn: DVec2::X }
     }
@@ -109,8 +113,29 @@ impl Crop {
     }
 }
 
-/// Returns upright squares of three sizes that cover an image, the whole image first.
-pub(crate) fn search_crops(width: u32, height: u32) -> Vec<Crop> {
+/// Returns the direction of an upright crop's x axis in a camera's image, to a quarter turn: [`DVec2::X`] unless the camera
+/// hangs on its side or upside down. `up` is the world's up direction.
+pub(crate) fn quarter_turn(camera: &Camera, up: DVec3) -> DVec2 {
+    let up = (camera.camera_from_world.rotation * up).truncate();
+    // Seen from above or below nobody stands upright in the image.
+    if !up.is_finite() || up.length() < FROM_ABOVE {
+        return DVec2::X;
+    }
+    let turn = up.perp();
+    if turn.x.abs() >= turn.y.abs() { DVec2::new(turn.x.signum(), 0.0) } else { DVec2::new(0.0, turn.y.signum()) }
+}
+
+/// Returns squares of three sizes that cover an image, the whole image first, in the turn of a person who stands upright; then
+/// those of the image's own upright direction where it is another, for rigs whose up direction is wrong.
+pub(crate) fn search_crops(width: u32, height: u32, turn: DVec2) -> Vec<Crop> {
+    let mut crops = covering_crops(width, height, turn);
+    if turn != DVec2::X {
+        crops.extend(covering_crops(width, height, DVec2::X));
+    }
+    crops
+}
+
+fn covering_crops(width: u32, height: u32, turn: DVec2) -> Vec<Crop> {
     let (width, height) = (f64::from(width), f64::from(height));
     let long = width.max(height);
     let mut crops = Vec::new();
@@ -125,7 +150,7 @@ pub(crate) fn search_crops(width: u32, height: u32) -> Vec<Crop> {
         };
         for y in centers(height) {
             for x in centers(width) {
-                crops.push(Crop::upright(DVec2::new(x, y), side));
+                crops.push(Crop { center: DVec2::new(x, y), side, turn });
             }
         }
     }
@@ -134,6 +159,9 @@ pub(crate) fn search_crops(width: u32, height: u32) -> Vec<Crop> {
 
 #[cfg(test)]
 mod tests {
+    use flyrig_types::{Intrinsics, Isometry};
+    use glam::DQuat;
+
     use super::*;
 
     #[test]
@@ -153,6 +181,33 @@ mod tests {
     }
 
     #[test]
+    fn a_camera_on_its_side_is_searched_on_its_side_and_upright() {
+        let upright = Isometry::look_at(DVec3::new(3.0, 0.0, 1.0), DVec3::Z, DVec3::Z);
+        let camera = |roll_deg: f64| Camera {
+            id: "a".into(),
+            intrinsics: Intrinsics::pinhole(640, 480, 500.0),
+            camera_from_world: Isometry {
+                rotation: DQuat::from_rotation_z(roll_deg.to_radians()) * upright.rotation,
+                ..upright
+            },
+            time_offset_nanos: 0,
+            color: Default::default(),
+        };
+        for (roll_deg, turn) in [(5.0, DVec2::X), (90.0, DVec2::Y), (-95.0, DVec2::NEG_Y), (178.0, DVec2::NEG_X)] {
+            assert_eq!(quarter_turn(&camera(roll_deg), DVec3::Z), turn, "{roll_deg}");
+        }
+        assert_eq!(quarter_turn(&camera(0.0), DVec3::X), DVec2::X, "from above");
+        assert_eq!(quarter_turn(&camera(0.0), DVec3::NAN), DVec2::X);
+        let (turned, upright) = (search_crops(64, 48, DVec2::Y), search_crops(64, 48, DVec2::X));
+        assert_eq!(turned[upright.len()..], upright);
+        // A person who is upright in the world is upright in the crop: feet, which lie at the image's left, are below.
+        let side = turned[0].crop_from_image(DVec2::new(0.0, 24.0));
+        let middle = turned[0].crop_from_image(DVec2::new(32.0, 24.0));
+        let (up, below) = (camera(90.0).camera_from_world.rotation * DVec3::Z, side.y > middle.y);
+        assert_eq!(below, up.x > 0.0, "{side} {up}");
+    }
+
+    #[test]
     fn points_that_span_nobody_have_no_crop() {
         assert_eq!(Crop::around(&[None; LANDMARK_COUNT]), None);
         assert_eq!(Crop::around(&[Some(DVec2::ONE); LANDMARK_COUNT]), None);
@@ -162,7 +217,7 @@ mod tests {
     #[test]
     fn search_covers_every_image_shape() {
         for (width, height) in [(1, 1), (540, 960), (4000, 300)] {
-            let crops = search_crops(width, height);
+            let crops = search_crops(width, height, DVec2::X);
             assert!((3..200).contains(&crops.len()));
             for corner in [DVec2::ZERO, DVec2::new(f64::from(width), f64::from(height))] {
                 for size in [1.0, 0.66, 0.45] {

@@ -11,7 +11,7 @@ use glam::{DVec2, DVec3};
 use rayon::prelude::*;
 
 use crate::error::TrackError;
-use crate::image::crop::{Crop, search_crops};
+use crate::image::crop::{Crop, quarter_turn, search_crops};
 use crate::image::grid::{Grid, components};
 use crate::image::pixels::Rgb;
 use crate::landmarks::keypoints::{LANDMARK_COUNT, ViewKeypoints};
@@ -38,6 +38,8 @@ const BLOBS: usize = 2;
 pub(crate) struct SearchScene<'a> {
     pub net: &'a PoseNet,
     pub cameras: &'a [Camera],
+    /// Up direction of the world, in which people are expected to stand.
+    pub up: DVec3,
     pub pictures: &'a [Option<Rgb<'a>>],
     /// Backgrounds in rig order.
     pub backgrounds: &'a [Option<Arc<Background>>],
@@ -132,7 +134,8 @@ impl ViewSearch {
         let background = scene.backgrounds.get(slot).and_then(Option::as_ref);
         let light = background.and_then(|background| background.light(picture, &|_| true));
         let evidence = light.and_then(|light| light.evidence(picture, [0, 0, picture.width, picture.height]));
-        for crop in evidence.map(|evidence| foreground_crops(&evidence, &taken)).unwrap_or_default() {
+        let turn = quarter_turn(&scene.cameras[slot], scene.up);
+        for crop in evidence.map(|evidence| foreground_crops(&evidence, &taken, turn)).unwrap_or_default() {
             self.try_crop(scene.net, scene.config, picture, crop, &taken, scene.nanos)?;
         }
         // Other views may see the same person at once; if they do not, the hypothesis may be wrong.
@@ -140,7 +143,7 @@ impl ViewSearch {
         if self.has_hope && !had_hope {
             return Ok(());
         }
-        let crops = search_crops(picture.width as u32, picture.height as u32);
+        let crops = search_crops(picture.width as u32, picture.height as u32, turn);
         let most = if scene.config.search_crops == 0 { crops.len() } else { scene.config.search_crops };
         for _ in 0..most.min(crops.len()) {
             self.try_crop(scene.net, scene.config, picture, crops[self.next % crops.len()], &taken, scene.nanos)?;
@@ -187,14 +190,14 @@ impl ViewSearch {
 /// Returns all people whom the network finds in an image, best first.
 pub(crate) fn sightings(net: &PoseNet, picture: &Rgb, config: &PoseConfig) -> Result<Vec<Sighting>, TrackError> {
     let mut view = ViewSearch::default();
-    for crop in search_crops(picture.width as u32, picture.height as u32) {
+    for crop in search_crops(picture.width as u32, picture.height as u32, DVec2::X) {
         view.try_crop(net, config, picture, crop, &[], 0)?;
     }
     Ok(view.found.into_iter().map(|(sighting, _)| sighting).collect())
 }
 
 /// Returns squares around the largest pieces of foreground, except those of people who are tracked already.
-fn foreground_crops(evidence: &Grid, taken: &[[Option<DVec2>; LANDMARK_COUNT]]) -> Vec<Crop> {
+fn foreground_crops(evidence: &Grid, taken: &[[Option<DVec2>; LANDMARK_COUNT]], turn: DVec2) -> Vec<Crop> {
     let (width, height) = (evidence.width, evidence.height);
     // A vote among neighbours removes specks.
     let mut grid = evidence.box_mean(1);
@@ -231,7 +234,11 @@ fn foreground_crops(evidence: &Grid, taken: &[[Option<DVec2>; LANDMARK_COUNT]]) 
     boxes.truncate(BLOBS);
     boxes
         .into_iter()
-        .map(|(_, low, high)| Crop::upright(0.5 * (low + high), BLOB_MARGIN * (high - low + 1.0).max_element()))
+        .map(|(_, low, high)| Crop {
+            center: 0.5 * (low + high),
+            side: BLOB_MARGIN * (high - low + 1.0).max_element(),
+            turn,
+        })
         .collect()
 }
 
@@ -340,13 +347,13 @@ mod tests {
 
     #[test]
     fn foreground_is_tried_largest_first_and_without_people_who_are_known() {
-        let crops = foreground_crops(&scene(), &[]);
+        let crops = foreground_crops(&scene(), &[], DVec2::X);
         assert_eq!(crops.len(), 2);
         assert!(crops[0].center.distance(DVec2::new(84.5, 59.5)) < 1.5, "{:?}", crops[0]);
         assert!((80.0..115.0).contains(&crops[0].side), "{:?}", crops[0]);
         let mut known = [None; LANDMARK_COUNT];
         (known[0], known[31]) = (Some(DVec2::new(85.0, 22.0)), Some(DVec2::new(85.0, 98.0)));
-        let crops = foreground_crops(&scene(), &[known]);
+        let crops = foreground_crops(&scene(), &[known], DVec2::X);
         assert_eq!(crops.len(), 1);
         assert!(crops[0].center.distance(DVec2::new(19.5, 59.5)) < 1.5, "{:?}", crops[0]);
     }
@@ -372,6 +379,7 @@ mod tests {
         let scene = SearchScene {
             net: &net,
             cameras: &rig.cameras,
+            up: rig.world_up,
             pictures: &[],
             backgrounds: &[],
             nanos: 0,
@@ -397,10 +405,10 @@ mod tests {
 
     #[test]
     fn no_foreground_and_poisoned_people_give_no_crop_too_many() {
-        assert!(foreground_crops(&Grid::new(SIDE, SIDE, 0.1), &[]).is_empty());
-        assert!(foreground_crops(&Grid::new(SIDE, SIDE, f32::NAN), &[]).is_empty());
-        assert!(foreground_crops(&Grid::new(0, 0, 0.0), &[]).is_empty());
-        assert_eq!(foreground_crops(&scene(), &[[None; LANDMARK_COUNT]]).len(), 2);
-        assert_eq!(foreground_crops(&scene(), &[[Some(DVec2::NAN); LANDMARK_COUNT]]).len(), 2);
+        assert!(foreground_crops(&Grid::new(SIDE, SIDE, 0.1), &[], DVec2::X).is_empty());
+        assert!(foreground_crops(&Grid::new(SIDE, SIDE, f32::NAN), &[], DVec2::X).is_empty());
+        assert!(foreground_crops(&Grid::new(0, 0, 0.0), &[], DVec2::X).is_empty());
+        assert_eq!(foreground_crops(&scene(), &[[None; LANDMARK_COUNT]], DVec2::X).len(), 2);
+        assert_eq!(foreground_crops(&scene(), &[[Some(DVec2::NAN); LANDMARK_COUNT]], DVec2::X).len(), 2);
     }
 }

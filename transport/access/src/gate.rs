@@ -4,7 +4,10 @@ use std::{
     collections::HashMap,
     net::{IpAddr, Ipv4Addr, SocketAddr},
     path::PathBuf,
-    sync::{Arc, Mutex},
+    sync::{
+        Arc, Mutex,
+        atomic::{AtomicU64, Ordering},
+    },
     time::{Duration, SystemTime, UNIX_EPOCH},
 };
 
@@ -27,11 +30,12 @@ use tokio_rustls::{
 };
 
 use crate::{
+    ends::{EndWatch, certificate_end},
     error::AccessError,
-    holder::Holder,
+    holder::{Holder, covers},
     issue::{Authority, CertificatePair, TlsSide},
     listener::{Bounds, Connection, Listener, Serve},
-    ring_folder::{Ring, fingerprint, list_time, read_holders},
+    ring_folder::{Ring, fingerprint, parse_holders, read_list_text},
     role::Role,
     tls,
 };
@@ -40,6 +44,8 @@ use crate::{
 const PATIENCE: Duration = Duration::from_secs(5);
 /// Interval between checks of the list of holders, and the longest time that a key outlives its end.
 const CHECK_EVERY: Duration = Duration::from_millis(500);
+/// Number of those checks from one look at the ends of keys to the next: a minute.
+const CHECKS_OF_ENDS: u64 = 120;
 /// Largest number of connections of one key at a time.
 const CONNECTIONS_OF_ONE: usize = 16;
 /// Largest number of admitted connections at a time.
@@ -100,6 +106,7 @@ impl Inner {
 #[derive(Debug)]
 pub struct Gate {
     listener: Listener,
+    list: Arc<List>,
 }
 
 impl Gate {
@@ -119,9 +126,13 @@ impl Gate {
         let list = Arc::new(List {
             folder: ring.folder().to_owned(),
             roles: roles.to_vec(),
-            read_at: Mutex::default(),
+            topic_prefix: ring.topic_prefix(),
+            certificate_end: certificate_end(&ring.own().certificate).map_err(damaged)?,
+            read: Mutex::default(),
             holders: Mutex::new(ring.holders().to_vec()),
             changes: watch::Sender::new(0),
+            failures: AtomicU64::new(0),
+            left_out: AtomicU64::new(0),
         });
         let verifier = Arc::new(Admission { chain, list: Arc::clone(&list) });
         let own = ring.own();
@@ -130,14 +141,20 @@ impl Gate {
         let listener = Listener::bind(address, bounds).map_err(|problem| AccessError::Listen { address, problem })?;
         let shared = Arc::new(Shared {
             acceptor: TlsAcceptor::from(Arc::new(server)),
-            list,
+            list: Arc::clone(&list),
             inner,
             session,
             connections: Mutex::default(),
             refusals: Mutex::default(),
         });
         let listener = listener.start("gate", shared).map_err(AccessError::system)?;
-        Ok(Self { listener })
+        Ok(Self { listener, list })
+    }
+
+    /// Returns the holders as this gate knows them at any time.
+    #[must_use]
+    pub fn holders(&self) -> HolderList {
+        HolderList(Arc::clone(&self.list))
     }
 
     /// Returns the address that is listened on.
@@ -151,15 +168,49 @@ fn now_secs() -> u64 {
     SystemTime::now().duration_since(UNIX_EPOCH).map_or(0, |since| since.as_secs())
 }
 
+/// Holders as a running gate knows them.
+#[derive(Debug, Clone)]
+pub struct HolderList(Arc<List>);
+
+impl HolderList {
+    /// Returns whether the holder with this name in topics may send a camera at present. Logs the 1st, 2nd, 4th message that is left out.
+    #[must_use]
+    pub fn may_send(&self, topic_name: &str, camera: &str) -> bool {
+        let list = &*self.0;
+        let number = topic_name.strip_prefix(&list.topic_prefix).and_then(|number| number.parse().ok());
+        let holders = lock(&list.holders);
+        let holder = holders.iter().find(|of| !of.revoked && of.role == Role::Cameras && Some(of.number) == number);
+        if holder.is_some_and(|holder| covers(&holder.cameras, camera)) {
+            return true;
+        }
+        let count = list.left_out.fetch_add(1, Ordering::Relaxed) + 1;
+        if let Some(Holder { name, cameras, .. }) = holder.filter(|_| count.is_power_of_two()) {
+            tracing::warn!(
+                "keys: messages as camera {camera} are left out: the key of '{name}' is for {}; make one with `flyrig keys add NAME --role cameras --camera {camera}` ({count} so far)",
+                cameras.join(", ")
+            );
+        }
+        false
+    }
+}
+
 /// List of holders as read last.
 #[derive(Debug)]
 struct List {
     folder: PathBuf,
     roles: Vec<Role>,
-    read_at: Mutex<Option<SystemTime>>,
+    /// Part before the number in the names of this ring's holders in topics.
+    topic_prefix: String,
+    certificate_end: SystemTime,
+    /// Text that was read and understood last. Times of files would not do: two changes within their resolution look like one.
+    read: Mutex<String>,
     holders: Mutex<Vec<Holder>>,
     /// Number of changes.
     changes: watch::Sender<u64>,
+    /// Number of failures to read the list since it was last read.
+    failures: AtomicU64,
+    /// Number of messages of cameras that were left out.
+    left_out: AtomicU64,
 }
 
 impl List {
@@ -173,18 +224,27 @@ impl List {
         })
     }
 
-    /// Reads the list again if it has changed.
+    /// Reads the list, and takes it over if it has changed. A list that cannot be read is tried again the next time.
     fn reload(&self) {
-        let now = list_time(&self.folder);
-        if now.is_none() || std::mem::replace(&mut *lock(&self.read_at), now) == now {
-            return;
-        }
-        match read_holders(&self.folder) {
-            Ok(holders) => {
+        let mut read = lock(&self.read);
+        let changed = read_list_text(&self.folder).and_then(|text| {
+            let is_new = text != *read;
+            is_new.then(|| parse_holders(&self.folder, &text).map(|holders| (text, holders))).transpose()
+        });
+        match changed {
+            Ok(changed) => {
+                self.failures.store(0, Ordering::Relaxed);
+                let Some((text, holders)) = changed else { return };
+                *read = text;
                 *lock(&self.holders) = holders;
                 self.changes.send_modify(|count| *count += 1);
             }
-            Err(error) => tracing::warn!("keys: the list cannot be read and stays as it was: {error}"),
+            Err(error) => {
+                let count = self.failures.fetch_add(1, Ordering::Relaxed) + 1;
+                if count.is_power_of_two() {
+                    tracing::warn!("keys: the list cannot be read and stays as it was ({count} times so far): {error}");
+                }
+            }
         }
     }
 
@@ -201,11 +261,18 @@ impl List {
     }
 }
 
-/// Reloads the list periodically.
+/// Reloads the list periodically, and logs the ends of keys that are near.
 async fn follow(list: &List) {
-    loop {
+    let mut ends = EndWatch::default();
+    for turn in 0u64.. {
         sleep(CHECK_EVERY).await;
         list.reload();
+        if turn % CHECKS_OF_ENDS == 0 {
+            let of_gate = |holder: &&Holder| list.roles.contains(&holder.role);
+            let holders: Vec<Holder> = lock(&list.holders).iter().filter(of_gate).cloned().collect();
+            let due = ends.due(&holders, Some(list.certificate_end), SystemTime::now());
+            due.iter().for_each(|line| tracing::warn!("{line}"));
+        }
     }
 }
 
@@ -359,6 +426,11 @@ async fn greet(connection: Connection, shared: Arc<Shared>) {
         Err(error) => return tracing::warn!("keys: {who} cannot be passed on: {error}"),
     };
     tracing::info!("keys: {who} ({}) connected", holder.role.name());
+    if holder.role == Role::Cameras && holder.cameras.is_empty() {
+        tracing::warn!(
+            "keys: {who} may send every camera, since its key names none; revoke it, and add it with --camera"
+        );
+    }
     tokio::select! {
         _ = copy_bidirectional_with_sizes(&mut client, &mut session, COPY_BYTES, COPY_BYTES) => tracing::info!("keys: {who} left"),
         why = until_refused(&certificate, &holder, &shared.list) => tracing::warn!("keys: {who} was disconnected: {why}"),

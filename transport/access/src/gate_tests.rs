@@ -124,6 +124,105 @@ fn a_list_that_cannot_be_read_changes_nothing() {
     key.knock().unwrap();
 }
 
+/// As a gate without file descriptors finds it: the list is there, and cannot be opened for a while.
+#[test]
+fn a_revocation_that_could_not_be_read_is_read_later_whatever_the_time_of_its_list() {
+    let mut place = place();
+    let key = place.add("desk");
+    let mut stream = connect(&key);
+    echo(&mut stream, b"hello");
+    std::thread::sleep(2 * CHECK_EVERY);
+    let list = place.ring.folder().join("ring.toml");
+    let copy = list.with_file_name("copy");
+    std::fs::create_dir(&copy).unwrap();
+    for name in ["ring.toml", "authority.pem", "authority-key.pem", "rig.pem", "rig-key.pem"] {
+        std::fs::copy(list.with_file_name(name), copy.join(name)).unwrap();
+    }
+    Ring::open(&copy).unwrap().revoke("desk").unwrap();
+    let revoked = copy.join("ring.toml");
+    // A folder of the same name and time cannot be read.
+    std::fs::remove_file(&list).unwrap();
+    std::fs::create_dir(&list).unwrap();
+    let time = std::fs::metadata(&list).unwrap().modified().unwrap();
+    std::thread::sleep(3 * CHECK_EVERY);
+    assert_eq!(echo(&mut stream, b"again"), b"vagain", "nothing is known yet");
+    std::fs::remove_dir(&list).unwrap();
+    std::fs::File::options().write(true).open(&revoked).unwrap().set_modified(time).unwrap();
+    std::fs::rename(&revoked, &list).unwrap();
+    let begun = Instant::now();
+    assert!(!matches!(stream.read(&mut [0; 9]), Ok(1..)), "nothing more comes");
+    assert!(begun.elapsed() < Duration::from_secs(2), "{:?}", begun.elapsed());
+    assert!(key.knock().unwrap_err().to_string().contains("it was revoked"));
+}
+
+#[test]
+fn two_changes_within_the_resolution_of_file_times_are_both_seen() {
+    let mut place = place();
+    let (one, two) = (place.add("one"), place.add("two"));
+    let list = place.ring.folder().join("ring.toml");
+    place.ring.revoke("one").unwrap();
+    let time = std::fs::metadata(&list).unwrap().modified().unwrap();
+    std::thread::sleep(3 * CHECK_EVERY);
+    assert!(one.knock().is_err());
+    two.knock().unwrap();
+    place.ring.revoke("two").unwrap();
+    std::fs::File::options().write(true).open(&list).unwrap().set_modified(time).unwrap();
+    std::thread::sleep(3 * CHECK_EVERY);
+    assert!(two.knock().unwrap_err().to_string().contains("it was revoked"));
+}
+
+#[test]
+fn revoked_and_expired_keys_are_refused_in_the_same_words_after_a_restart() {
+    let mut place = place();
+    let (revoked, forgotten) = (place.add("revoked"), place.add("forgotten"));
+    let expired = place.add_until("expired", now_secs() - 10);
+    place.ring.revoke("forgotten").unwrap();
+    // Only the holders revoked last stay listed.
+    place.add("busy");
+    for _ in 0..300 {
+        place.ring.renew("busy", 1).unwrap();
+    }
+    place.ring.revoke("revoked").unwrap();
+    assert!(place.ring.holders().iter().all(|of| of.name != "forgotten"));
+    std::thread::sleep(2 * CHECK_EVERY);
+    let refusals = |address: SocketAddr| {
+        [&revoked, &forgotten, &expired].map(|key| {
+            let here = KeyFile { connect: vec![address.to_string()], ..key.clone() };
+            here.knock().unwrap_err().to_string().replace(&address.to_string(), "HERE")
+        })
+    };
+    let before = refusals(place.gate.address());
+    for (text, part) in before.iter().zip(["it was revoked", "it was revoked", "it expired on"]) {
+        assert!(text.contains(part), "{text}");
+    }
+    let Place { _folder, ring, gate } = place;
+    drop(gate);
+    let inner = Inner::new().unwrap();
+    let session = session(&inner);
+    let any = SocketAddr::from(([127, 0, 0, 1], 0));
+    let gate = Gate::start(&Ring::open(ring.folder()).unwrap(), &[Role::Viewer], any, inner, session).unwrap();
+    assert_eq!(refusals(gate.address()), before);
+}
+
+#[test]
+fn a_holder_may_send_its_own_cameras_at_any_time() {
+    let mut place = place();
+    let file = place.ring.folder().join("a.key");
+    let a = place.ring.add_file(&file, "a", Role::Cameras, &["left".to_owned()], 1).unwrap();
+    let all = place.ring.add("all", Role::Cameras, 1).unwrap();
+    let viewer = place.ring.add("desk", Role::Viewer, 1).unwrap();
+    std::thread::sleep(2 * CHECK_EVERY);
+    let holders = place.gate.holders();
+    assert!(holders.may_send(&a.topic_name, "left") && !holders.may_send(&a.topic_name, "right"));
+    assert!(holders.may_send(&all.topic_name, "right"));
+    for name in [viewer.topic_name.as_str(), "", "ffffffff-0", "*"] {
+        assert!(!holders.may_send(name, "left"), "{name}");
+    }
+    place.ring.revoke("a").unwrap();
+    std::thread::sleep(2 * CHECK_EVERY);
+    assert!(!holders.may_send(&a.topic_name, "left"));
+}
+
 #[test]
 fn one_key_has_its_share_of_connections() {
     let mut place = place();

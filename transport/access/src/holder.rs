@@ -9,6 +9,14 @@ use crate::role::Role;
 /// Largest number of holders of a ring at a time.
 pub const MAX_HOLDERS: usize = 256;
 
+/// Largest number of cameras of a key.
+pub(crate) const MAX_CAMERAS: usize = 32;
+
+/// Returns whether a key for these cameras may send `camera`; one that names none may send every camera.
+pub(crate) fn covers(cameras: &[String], camera: &str) -> bool {
+    cameras.is_empty() || cameras.iter().any(|name| name == camera)
+}
+
 /// Holder of a key, as the ring lists it.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
@@ -19,6 +27,9 @@ pub struct Holder {
     pub role: Role,
     /// Number among the holders, 0..[`MAX_HOLDERS`].
     pub number: usize,
+    /// Cameras that a key of role [`Role::Cameras`] may send; every camera where none is named, as in older keys.
+    #[serde(default, skip_serializing_if = "Vec::is_empty")]
+    pub cameras: Vec<String>,
     /// Time after which the key is refused, RFC 3339.
     pub expires: String,
     /// SHA-256 of the certificate, hexadecimal.

@@ -4,10 +4,19 @@ use std::path::Path;
 
 use serde::{Deserialize, Serialize};
 
-use crate::{error::AccessError, holder::Holder, issue::CertificatePair, role::Role, secret_file::write_secret, tls};
+use crate::{
+    error::AccessError,
+    holder::{Holder, covers},
+    issue::CertificatePair,
+    role::Role,
+    secret_file::write_secret,
+    tls,
+};
 
 /// Largest key file that is read, bytes.
 const MAX_KEY_FILE_BYTES: u64 = 64 << 10;
+/// Beginning of every key file.
+const BEGINNING: &str = "# Key of '";
 /// Version of the format.
 const VERSION: u32 = 1;
 
@@ -23,6 +32,9 @@ pub struct KeyFile {
     pub holder: String,
     /// Role of the holder.
     pub role: Role,
+    /// Cameras that a holder of role [`Role::Cameras`] may send; every camera where none is named, as in older keys.
+    #[serde(default, skip_serializing_if = "Vec::is_empty")]
+    pub cameras: Vec<String>,
     /// Name in topics: the ring's identifier and the holder's number.
     pub topic_name: String,
     /// Addresses of the rig, `HOST:PORT`.
@@ -66,6 +78,7 @@ impl KeyFile {
             rig: rig.to_owned(),
             holder: holder.name.clone(),
             role: holder.role,
+            cameras: holder.cameras.clone(),
             topic_name,
             connect,
             expires: holder.expires.clone(),
@@ -116,6 +129,13 @@ impl KeyFile {
         Ok(key)
     }
 
+    /// Returns whether a file holds the beginning of a key, or nothing yet, as [`Self::write_new`] leaves it when its process is ended.
+    pub(crate) fn is_half(path: &Path) -> bool {
+        let is_beginning =
+            |text: Vec<u8>| text.starts_with(BEGINNING.as_bytes()) || BEGINNING.as_bytes().starts_with(&text);
+        std::fs::read(path).is_ok_and(is_beginning) && Self::read_any(path).is_err()
+    }
+
     /// Checks the fields that other modules rely on.
     fn check(&self) -> Result<(), String> {
         let is_name = |text: &str| {
@@ -132,6 +152,12 @@ impl KeyFile {
         tls::client(&self.authority, &self.certificate, &self.private_key).map(|_| ())
     }
 
+    /// Returns whether the rig takes this camera from the holder.
+    #[must_use]
+    pub fn may_send(&self, camera: &str) -> bool {
+        self.role == Role::Cameras && covers(&self.cameras, camera)
+    }
+
     /// Writes a file that only its owner may read.
     ///
     /// # Errors
@@ -139,7 +165,7 @@ impl KeyFile {
     pub fn write_new(&self, path: &Path) -> Result<(), AccessError> {
         let body = toml::to_string(self).map_err(AccessError::system)?;
         let text = format!(
-            "# Key of '{}' ({}) to the rig '{}', valid until {}.\n# Keep it secret: its holder connects as '{}'.\n{body}",
+            "{BEGINNING}{}' ({}) to the rig '{}', valid until {}.\n# Keep it secret: its holder connects as '{}'.\n{body}",
             self.holder,
             self.role.name(),
             self.rig,

@@ -1,10 +1,8 @@
 //! Bounds, per address, on connections that are not established yet.
 
-use std::{
-    collections::HashMap,
-    net::IpAddr,
-    time::{Duration, Instant},
-};
+use std::{collections::HashMap, net::IpAddr, time::Instant};
+
+use flyrig_types::saturating_secs;
 
 /// Connections per second that one address may begin on average.
 const PER_SECOND: f64 = 20.0;
@@ -35,7 +33,8 @@ pub(crate) struct Limits {
     pending: usize,
 }
 
-fn network(address: IpAddr) -> IpAddr {
+/// Returns the network that counts as one client: an IPv4 address, or 64 bits of an IPv6 address.
+pub(crate) fn network(address: IpAddr) -> IpAddr {
     match address {
         IpAddr::V4(_) => address,
         IpAddr::V6(v6) => v6.to_ipv4_mapped().map_or_else(
@@ -50,7 +49,7 @@ impl Limits {
     pub fn begin(&mut self, address: IpAddr, now: Instant) -> bool {
         if self.visitors.len() >= ADDRESSES {
             // After this time a visitor has its whole burst again.
-            let full = Duration::from_secs_f64(BURST / PER_SECOND);
+            let full = saturating_secs(BURST / PER_SECOND);
             self.visitors.retain(|_, visitor| visitor.pending > 0 || now.duration_since(visitor.at) < full);
         }
         let network = network(address);
@@ -81,6 +80,8 @@ impl Limits {
 
 #[cfg(test)]
 mod tests {
+    use std::time::Duration;
+
     use super::*;
 
     #[test]

@@ -1,8 +1,9 @@
 //! TCP listener with bounds, shared by the gate, the web page and the metrics page.
 //!
-//! One thread accepts connections and serves them as tasks. Connections beyond [`Bounds::connections`] wait in the system's queue.
-//! Where [`Bounds::per_address`] is set, an address that begins too many connections, or has too many handshakes under way, is
-//! disconnected at once ([`crate::limits`]); the place of a handshake is given back by [`Connection::established`].
+//! One thread accepts connections and serves them as tasks. A connection beyond [`Bounds::connections`], or beyond the file descriptors
+//! that the rest of the process needs ([`crate::open_files`]), takes the place of one that is not established ([`crate::places`]); where
+//! all are, it waits, or is disconnected for lack of a descriptor. Where [`Bounds::per_address`] is set, an address that begins too many
+//! connections, or has too many handshakes under way, is disconnected at once ([`crate::limits`]).
 
 use std::{
     future::{Future, pending},
@@ -22,7 +23,7 @@ use tokio::{
     time::sleep,
 };
 
-use crate::limits::Limits;
+use crate::{limits::Limits, open_files, places::Places};
 
 /// Pause after a connection could not be accepted: with no file descriptor left, an immediate retry only costs time.
 const PAUSE: Duration = Duration::from_millis(100);
@@ -37,7 +38,7 @@ const UNSENT: u32 = 4 << 10;
 /// Bounds and socket options of a [`Listener`].
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct Bounds {
-    /// Most connections served at a time.
+    /// Most connections served at a time; further ones end those that are not established.
     pub connections: usize,
     /// Whether connections are bounded per address until they are established.
     pub per_address: bool,
@@ -66,21 +67,25 @@ pub struct Connection {
     pub stream: TcpStream,
     /// Address of the other side.
     pub address: IpAddr,
-    /// ConnectionPlace among the connections.
+    /// Place among the connections.
     pub place: ConnectionPlace,
 }
 
-/// ConnectionPlace of a connection among all of its listener, given back when it is dropped.
+/// Place of a connection among all of its listener, given back when it is dropped.
 #[derive(Debug)]
 pub struct ConnectionPlace {
     _permit: OwnedSemaphorePermit,
+    number: u64,
+    /// Places of the listener that may be taken away.
+    places: Arc<Mutex<Places>>,
     /// Counts of the listener, while the connection is not established and counts by address.
     handshake: Option<(Arc<Mutex<Limits>>, IpAddr)>,
 }
 
 impl ConnectionPlace {
-    /// Ends the handshake: the connection does not count against its address any more.
+    /// Ends the handshake: the connection does not count against its address any more, and keeps its place.
     pub fn established(&mut self) {
+        lock(&self.places).remove(self.number);
         if let Some((limits, address)) = self.handshake.take() {
             lock(&limits).end(address);
         }
@@ -156,6 +161,16 @@ impl BoundListener {
     /// # Errors
     /// When the system starts no thread or runtime.
     pub fn start(self, thread: &str, service: Arc<impl Serve>) -> Result<Listener> {
+        self.start_with(thread, service, open_files::admit)
+    }
+
+    /// Serves connections that `admit` lets in; others only in place of those that are not established.
+    fn start_with(
+        self,
+        thread: &str,
+        service: Arc<impl Serve>,
+        admit: impl Fn() -> bool + Send + 'static,
+    ) -> Result<Listener> {
         let Self { listener, address, bounds } = self;
         let runtime = runtime::Builder::new_current_thread().enable_io().enable_time().build()?;
         let listener = {
@@ -166,7 +181,7 @@ impl BoundListener {
         let work = move || {
             runtime.block_on(async {
                 tokio::select! {
-                    () = accept(&listener, bounds, &service) => {}
+                    () = accept(&listener, bounds, &service, admit) => {}
                     () = service.beside() => {}
                     _ = stopped => {}
                 }
@@ -192,27 +207,51 @@ fn listen(address: SocketAddr, bounds: Bounds) -> Result<std::net::TcpListener> 
     Ok(socket.into())
 }
 
-async fn accept(listener: &TcpListener, bounds: Bounds, service: &Arc<impl Serve>) {
+async fn accept(listener: &TcpListener, bounds: Bounds, service: &Arc<impl Serve>, admit: impl Fn() -> bool) {
     let permits = Arc::new(Semaphore::new(bounds.connections));
     let limits = bounds.per_address.then(|| Arc::new(Mutex::new(Limits::default())));
-    while let Ok(permit) = Arc::clone(&permits).acquire_owned().await {
+    let places = Arc::<Mutex<Places>>::default();
+    let mut refused = 0;
+    for number in 0.. {
         let Ok((stream, address)) = listener.accept().await else {
+            lock(&places).end_oldest();
             sleep(PAUSE).await;
             continue;
         };
         let address = address.ip();
+        if !admit() && !lock(&places).end_oldest() {
+            refused += 1;
+            // The 1st, 2nd, 4th ...: a flood must not fill the disk.
+            if u64::is_power_of_two(refused) {
+                tracing::warn!(
+                    "{address} is not admitted ({refused} so far): too few file descriptors are left; raise the limit (ulimit -n)"
+                );
+            }
+            continue;
+        }
         let begins = |limits: &Mutex<Limits>| lock(limits).begin(address, Instant::now());
         if limits.as_deref().is_some_and(|limits| !begins(limits)) {
             service.refuse(address);
             continue;
         }
+        let handshake = limits.clone().map(|limits| (limits, address));
+        let permit = match Arc::clone(&permits).try_acquire_owned() {
+            Ok(permit) => permit,
+            Err(_) => {
+                lock(&places).end_oldest();
+                let Ok(permit) = Arc::clone(&permits).acquire_owned().await else { return };
+                permit
+            }
+        };
         if bounds.is_streaming {
             let _ = stream.set_nodelay(true);
             #[cfg(target_os = "linux")]
             let _ = socket2::SockRef::from(&stream).set_tcp_notsent_lowat(UNSENT);
         }
-        let place = ConnectionPlace { _permit: permit, handshake: limits.clone().map(|limits| (limits, address)) };
-        tokio::spawn(Arc::clone(service).serve(Connection { stream, address, place }));
+        let place = ConnectionPlace { _permit: permit, number, places: Arc::clone(&places), handshake };
+        let task = tokio::spawn(Arc::clone(service).serve(Connection { stream, address, place }));
+        // The task runs in this thread, so it has not ended yet.
+        lock(&places).add(number, address, task.abort_handle());
     }
 }
 
@@ -247,10 +286,18 @@ mod tests {
     }
 
     fn start(connections: usize, per_address: bool) -> (Arc<Echo>, Listener) {
+        start_with(connections, per_address, || true)
+    }
+
+    fn start_with(
+        connections: usize,
+        per_address: bool,
+        admit: impl Fn() -> bool + Send + 'static,
+    ) -> (Arc<Echo>, Listener) {
         let bounds = Bounds { connections, per_address, is_streaming: true };
         let service = Arc::<Echo>::default();
         let bound = Listener::bind((Ipv4Addr::LOCALHOST, 0), bounds).unwrap();
-        let listener = bound.start("echo", Arc::clone(&service)).unwrap();
+        let listener = bound.start_with("echo", Arc::clone(&service), admit).unwrap();
         (service, listener)
     }
 
@@ -265,11 +312,70 @@ mod tests {
         client.write_all(&[7]).is_ok() && client.read_exact(&mut byte).is_ok() && byte == [8]
     }
 
+    /// Returns whether the listener has ended a connection on which nothing was said.
+    fn has_ended(client: &mut Client) -> bool {
+        !matches!(client.read(&mut [0]), Err(error) if matches!(error.kind(), ErrorKind::WouldBlock | ErrorKind::TimedOut))
+    }
+
+    #[test]
+    fn silent_connections_make_room_for_new_ones() {
+        let (_, listener) = start(3, false);
+        let mut established = connect(&listener);
+        assert!(is_answered(&mut established));
+        let mut silent: Vec<Client> = (0..50).map(|_| connect(&listener)).collect();
+        for _ in 0..20 {
+            assert!(is_answered(&mut connect(&listener)));
+        }
+        assert!(silent[..48].iter_mut().all(has_ended), "the oldest ones make room");
+        assert!(is_answered(&mut established), "one that is established stays");
+    }
+
+    #[test]
+    fn the_address_with_the_most_connections_makes_room() {
+        let runtime = runtime::Builder::new_current_thread().build().unwrap();
+        let _inside = runtime.enter();
+        let tasks: Vec<_> = (0..6).map(|_| tokio::spawn(pending::<()>())).collect();
+        let mut places = Places::default();
+        for (number, host) in [1, 2, 2, 1, 2, 3].into_iter().enumerate() {
+            places.add(number as u64, IpAddr::from([10, 0, 0, host]), tasks[number].abort_handle());
+        }
+        places.remove(5);
+        let mut ended = || {
+            let before: Vec<bool> = tasks.iter().map(tokio::task::JoinHandle::is_finished).collect();
+            let any = places.end_oldest();
+            runtime.block_on(tokio::task::yield_now());
+            any.then(|| (0..6).find(|n| tasks[*n].is_finished() && !before[*n]).unwrap())
+        };
+        let order: Vec<_> = std::iter::from_fn(&mut ended).collect();
+        assert_eq!(order, [1, 0, 2, 3, 4]);
+        assert!(!tasks[5].is_finished());
+    }
+
+    #[test]
+    fn without_file_descriptors_a_new_connection_takes_the_place_of_a_silent_one_or_none() {
+        let left = Mutex::new(3);
+        let admit = move || {
+            let mut left = left.lock().unwrap();
+            *left -= i32::from(*left > 0);
+            *left > 0
+        };
+        let (_, listener) = start_with(100, false, admit);
+        let mut established = connect(&listener);
+        assert!(is_answered(&mut established));
+        let mut silent = connect(&listener);
+        std::thread::sleep(Duration::from_millis(100));
+        let mut new = connect(&listener);
+        assert!(is_answered(&mut new));
+        assert!(has_ended(&mut silent));
+        assert!(has_ended(&mut connect(&listener)) && is_answered(&mut established) && is_answered(&mut new));
+    }
+
     #[test]
     fn connections_beyond_the_bound_wait_for_a_place() {
         let (_, listener) = start(2, false);
-        let mut open: Vec<Client> = (0..3).map(|_| connect(&listener)).collect();
+        let mut open: Vec<Client> = (0..2).map(|_| connect(&listener)).collect();
         assert!(is_answered(&mut open[0]) && is_answered(&mut open[1]));
+        open.push(connect(&listener));
         assert!(!is_answered(&mut open[2]));
         drop(open.remove(0));
         open[1].set_read_timeout(Some(Duration::from_secs(20))).unwrap();

@@ -12,11 +12,13 @@ use serde::{Deserialize, Serialize};
 
 use crate::{
     error::AccessError,
-    holder::{Holder, MAX_HOLDERS},
+    folder_lock::FolderLock,
+    holder::{Holder, MAX_CAMERAS, MAX_HOLDERS},
+    hosts::{check_hosts, host_and_port, listen_address},
     issue::{Authority, CertificatePair, TlsSide},
     key_file::KeyFile,
     role::Role,
-    secret_file::write_secret,
+    secret_file::{already_there, write_secret},
 };
 
 /// Default port of the gate for viewers; cameras have the next port.
@@ -89,25 +91,39 @@ fn check_name(what: &str, name: &str) -> Result<(), AccessError> {
     Err(AccessError::Request(format!("{what} '{name}': use 1 to 64 of the characters A-Z a-z 0-9 _ -")))
 }
 
-/// Reads the list of holders alone; the gate does so repeatedly.
+/// Reads the list of holders alone.
 pub(crate) fn read_holders(folder: &Path) -> Result<Vec<Holder>, AccessError> {
     read_list(folder).map(|list| list.holders)
 }
 
+/// Reads the text of the list; the gate does so repeatedly.
+pub(crate) fn read_list_text(folder: &Path) -> Result<String, AccessError> {
+    read(&folder.join(LIST))
+}
+
+/// Returns the holders in the text of a list.
+pub(crate) fn parse_holders(folder: &Path, text: &str) -> Result<Vec<Holder>, AccessError> {
+    parse_list(folder, text).map(|list| list.holders)
+}
+
+/// Reads the rig's certificate, PEM.
+pub(crate) fn read_certificate(folder: &Path) -> Result<String, AccessError> {
+    read(&folder.join(OWN[0]))
+}
+
 fn read_list(folder: &Path) -> Result<List, AccessError> {
+    parse_list(folder, &read_list_text(folder)?)
+}
+
+fn parse_list(folder: &Path, text: &str) -> Result<List, AccessError> {
     let path = folder.join(LIST);
-    let list: List = toml::from_str(&read(&path)?)
+    let list: List = toml::from_str(text)
         .map_err(|error| AccessError::file(&path, format!("is no list of keys ({})", error.message())))?;
     if list.version != VERSION {
         let problem = format!("is of version {}, this program knows {VERSION}; update flyrig", list.version);
         return Err(AccessError::file(&path, problem));
     }
     Ok(list)
-}
-
-/// Returns the modification time of the list, which reveals a change.
-pub(crate) fn list_time(folder: &Path) -> Option<SystemTime> {
-    std::fs::metadata(folder.join(LIST)).and_then(|of| of.modified()).ok()
 }
 
 impl Ring {
@@ -117,12 +133,7 @@ impl Ring {
     /// [`AccessError::Request`] for a bad name or no host, [`AccessError::File`] when the folder exists or cannot be written.
     pub fn create(folder: &Path, rig: &str, hosts: &[String], port: u16) -> Result<Self, AccessError> {
         check_name("rig", rig)?;
-        if hosts.is_empty() {
-            return Err(AccessError::Request(
-                "a ring needs a name or address by which other computers reach the rig; give --host".to_owned(),
-            ));
-        }
-        check_hosts(hosts)?;
+        let hosts = check_hosts(hosts)?;
         if port == 0 || port == u16::MAX {
             return Err(AccessError::Request(format!("--port {port}: use 1 to 65534; cameras have the port after it")));
         }
@@ -133,15 +144,21 @@ impl Ring {
             version: VERSION,
             rig: rig.to_owned(),
             id,
-            hosts: hosts.to_vec(),
-            listen: SocketAddr::from(([0, 0, 0, 0], port)),
+            listen: listen_address(&hosts, port),
+            hosts,
             holders: Vec::new(),
         };
         let now = unix_secs();
         let valid = (now, now + RING_DAYS * 86_400);
         let (authority, secret) = Authority::new(&authority_name(&list), valid)?;
-        let own = authority.sign(&own_name(&list), hosts, TlsSide::Server, valid)?;
+        let own = authority.sign(&own_name(&list), &list.hosts, TlsSide::Server, valid)?;
         let failed = |error: std::io::Error| match error.kind() {
+            std::io::ErrorKind::AlreadyExists if folder.join(AUTHORITY[1]).exists() && !folder.join(LIST).exists() => {
+                AccessError::file(
+                    folder,
+                    "holds half a ring, whose `flyrig keys new` was ended midway; delete it first",
+                )
+            }
             std::io::ErrorKind::AlreadyExists => {
                 AccessError::file(folder, "is there already; name a new folder with --out")
             }
@@ -219,7 +236,12 @@ impl Ring {
     }
 
     fn topic_name(&self, number: usize) -> String {
-        format!("{}-{number}", self.list.id)
+        format!("{}{number}", self.topic_prefix())
+    }
+
+    /// Returns the part of the names in topics before the number.
+    pub(crate) fn topic_prefix(&self) -> String {
+        format!("{}-", self.list.id)
     }
 
     pub(crate) fn own(&self) -> &CertificatePair {
@@ -230,55 +252,122 @@ impl Ring {
         &self.authority
     }
 
-    /// Issues a key, valid for `days`.
+    /// Issues a key, valid for `days`. A key of role [`Role::Cameras`] may send every camera.
     ///
     /// # Errors
-    /// [`AccessError::Request`] for a bad name, a name that is taken, or more holders than there is room for.
+    /// [`AccessError::Request`] for a bad name, a name that is taken, or more holders than there is room for; [`AccessError::File`] when
+    /// the folder cannot be changed.
     pub fn add(&mut self, name: &str, role: Role, days: u64) -> Result<KeyFile, AccessError> {
-        check_name("holder", name)?;
-        if self.valid_holder(name).is_some() {
-            return Err(AccessError::Request(format!(
-                "'{name}' has a key already; make a new one with `flyrig keys renew {name}`, or take it away with `flyrig keys revoke {name}`"
-            )));
-        }
-        // Numbers of revoked holders are free: those are refused by their certificates.
-        let taken = |number: &usize| self.list.holders.iter().any(|of| of.number == *number && !of.revoked);
-        let Some(number) = (0..MAX_HOLDERS).find(|number| !taken(number)) else {
-            return Err(AccessError::Request(format!("there are {MAX_HOLDERS} keys already; revoke one")));
-        };
-        self.issue(name, role, number, days)
+        self.change(|ring, lock| ring.issue_new(lock, name, (role, &[]), days, None))
     }
 
-    /// Issues a new key to a holder, valid for `days`; the old one is refused from now on.
+    /// Issues a key like [`Self::add`] and writes it to a new file, before it is listed. A key of role [`Role::Cameras`] may send these
+    /// cameras; every camera where none is named.
     ///
     /// # Errors
-    /// [`AccessError::Request`] when no holder of this name has a key.
+    /// As [`Self::add`], and when the file exists or cannot be written; nothing is changed then.
+    pub fn add_file(
+        &mut self,
+        file: &Path,
+        name: &str,
+        role: Role,
+        cameras: &[String],
+        days: u64,
+    ) -> Result<KeyFile, AccessError> {
+        check_cameras(role, cameras)?;
+        self.change(|ring, lock| ring.issue_new(lock, name, (role, cameras), days, Some(file)))
+    }
+
+    /// Issues a new key to a holder, valid for `days` and for the same cameras; the old one is refused from now on.
+    ///
+    /// # Errors
+    /// [`AccessError::Request`] when no holder of this name has a key, [`AccessError::File`] when the folder cannot be changed.
     pub fn renew(&mut self, name: &str, days: u64) -> Result<KeyFile, AccessError> {
-        let Some(Holder { role, number, .. }) = self.valid_holder(name).cloned() else {
-            return Err(self.unknown_holder(name));
-        };
-        self.mark_revoked(name);
-        self.issue(name, role, number, days)
+        self.change(|ring, lock| ring.issue_again(lock, name, until(days)?, None))
+    }
+
+    /// Issues a new key like [`Self::renew`] and writes it to a new file, before the old one is refused.
+    ///
+    /// # Errors
+    /// As [`Self::renew`], and when the file exists or cannot be written; the old key stays valid then.
+    pub fn renew_file(&mut self, file: &Path, name: &str, days: u64) -> Result<KeyFile, AccessError> {
+        self.change(|ring, lock| ring.issue_again(lock, name, until(days)?, Some(file)))
     }
 
     /// Revokes the key of a holder; an open gate disconnects it.
     ///
     /// # Errors
-    /// [`AccessError::Request`] when no holder of this name has a key.
+    /// [`AccessError::Request`] when no holder of this name has a key, [`AccessError::File`] when the folder cannot be changed.
     pub fn revoke(&mut self, name: &str) -> Result<(), AccessError> {
-        if self.valid_holder(name).is_none() {
-            return Err(self.unknown_holder(name));
+        self.change(|ring, _| {
+            if ring.valid_holder(name).is_none() {
+                return Err(ring.unknown_holder(name));
+            }
+            ring.mark_revoked(name);
+            ring.save()
+        })
+    }
+
+    /// Reads the list again, and removes the key file that a command left unlisted when it was ended midway.
+    ///
+    /// # Errors
+    /// [`AccessError::File`] when the folder cannot be changed.
+    pub fn refresh(&mut self) -> Result<(), AccessError> {
+        self.change(|_, _| Ok(()))
+    }
+
+    /// Changes the list as it is in the folder, while no other command does; an error leaves it as it was.
+    fn change<T>(
+        &mut self,
+        work: impl FnOnce(&mut Self, &FolderLock) -> Result<T, AccessError>,
+    ) -> Result<T, AccessError> {
+        let lock = FolderLock::take(&self.folder)?;
+        let list = read_list(&self.folder)?;
+        if list.id != self.list.id {
+            return Err(AccessError::file(&self.folder, "was made anew meanwhile; try again"));
         }
-        self.mark_revoked(name);
-        self.save()
+        self.list = list;
+        self.finish_change(&lock);
+        let before = self.list.clone();
+        let done = work(self, &lock);
+        if done.is_err() {
+            self.list = before;
+        }
+        done
+    }
+
+    /// Removes the key file of a command that was ended before the list named its key.
+    fn finish_change(&self, lock: &FolderLock) {
+        let Some(file) = lock.unfinished() else { return };
+        let is_void = match KeyFile::read(&file, &Role::ALL) {
+            Ok(key) => self.is_unlisted(&key),
+            Err(_) => KeyFile::is_half(&file),
+        };
+        if is_void {
+            let file_name = file.display();
+            match std::fs::remove_file(&file) {
+                Ok(()) => tracing::warn!(
+                    "keys: {file_name} was removed: an earlier command was ended before its key became valid"
+                ),
+                Err(error) => tracing::warn!(
+                    "keys: {file_name} is not valid, since an earlier command was ended midway; delete it ({error})"
+                ),
+            }
+        }
+        lock.end();
+    }
+
+    /// Returns whether a key was made by this ring and is in no list.
+    fn is_unlisted(&self, key: &KeyFile) -> bool {
+        let print = CertificateDer::from_pem_slice(key.certificate.as_bytes()).map(|der| fingerprint(&der));
+        key.authority == self.authority.certificate
+            && print.is_ok_and(|print| self.list.holders.iter().all(|of| of.fingerprint != print))
     }
 
     /// Issues a new key to a holder that ends at a time, in seconds since 1970.
     #[cfg(test)]
     pub(crate) fn replace_validity(&mut self, name: &str, end: u64) -> KeyFile {
-        let Some(Holder { role, number, .. }) = self.valid_holder(name).cloned() else { panic!("no '{name}'") };
-        self.mark_revoked(name);
-        self.issue_until(name, role, number, end).unwrap_or_else(|error| panic!("{error}"))
+        self.change(|ring, lock| ring.issue_again(lock, name, end, None)).unwrap_or_else(|error| panic!("{error}"))
     }
 
     fn valid_holder(&self, name: &str) -> Option<&Holder> {
@@ -293,34 +382,79 @@ impl Ring {
     }
 
     fn mark_revoked(&mut self, name: &str) {
-        self.list.holders.iter_mut().filter(|of| of.name == name).for_each(|of| of.revoked = true);
+        for holder in self.list.holders.iter_mut().filter(|of| of.name == name) {
+            holder.revoked = true;
+            holder.cameras.clear();
+        }
     }
 
-    fn issue(&mut self, name: &str, role: Role, number: usize, days: u64) -> Result<KeyFile, AccessError> {
-        let now = unix_secs();
-        let Some(end) =
-            days.checked_mul(86_400).and_then(|secs| now.checked_add(secs)).filter(|_| (1..=36_500).contains(&days))
-        else {
-            return Err(AccessError::Request(format!("--days {days}: use 1 to 36500")));
+    fn issue_new(
+        &mut self,
+        lock: &FolderLock,
+        name: &str,
+        (role, cameras): (Role, &[String]),
+        days: u64,
+        file: Option<&Path>,
+    ) -> Result<KeyFile, AccessError> {
+        check_name("holder", name)?;
+        if self.valid_holder(name).is_some() {
+            return Err(AccessError::Request(format!(
+                "'{name}' has a key already; make a new one with `flyrig keys renew {name}`, or take it away with `flyrig keys revoke {name}`"
+            )));
+        }
+        // Numbers of revoked holders are free: those are refused by their certificates.
+        let taken = |number: &usize| self.list.holders.iter().any(|of| of.number == *number && !of.revoked);
+        let Some(number) = (0..MAX_HOLDERS).find(|number| !taken(number)) else {
+            return Err(AccessError::Request(format!("there are {MAX_HOLDERS} keys already; revoke one")));
         };
-        self.issue_until(name, role, number, end)
+        let rights = Rights { role, number, cameras: cameras.to_vec() };
+        self.issue(lock, name, rights, until(days)?, file)
     }
 
-    fn issue_until(&mut self, name: &str, role: Role, number: usize, end: u64) -> Result<KeyFile, AccessError> {
+    fn issue_again(
+        &mut self,
+        lock: &FolderLock,
+        name: &str,
+        end: u64,
+        file: Option<&Path>,
+    ) -> Result<KeyFile, AccessError> {
+        let Some(Holder { role, number, cameras, .. }) = self.valid_holder(name).cloned() else {
+            return Err(self.unknown_holder(name));
+        };
+        self.mark_revoked(name);
+        self.issue(lock, name, Rights { role, number, cameras }, end, file)
+    }
+
+    /// Signs a key that ends at a time, in seconds since 1970; writes it to the file, then lists it.
+    fn issue(
+        &mut self,
+        lock: &FolderLock,
+        name: &str,
+        rights: Rights,
+        end: u64,
+        file: Option<&Path>,
+    ) -> Result<KeyFile, AccessError> {
         let pair = self.authority.sign(name, &[], TlsSide::Client, (unix_secs(), end))?;
         let der = CertificateDer::from_pem_slice(pair.certificate.as_bytes()).map_err(AccessError::system)?;
         let expires = humantime::format_rfc3339_seconds(UNIX_EPOCH + Duration::from_secs(end)).to_string();
-        let holder =
-            Holder { name: name.to_owned(), role, number, expires, fingerprint: fingerprint(&der), revoked: false };
+        let (fingerprint, Rights { role, number, cameras }) = (fingerprint(&der), rights);
+        let holder = Holder { name: name.to_owned(), role, number, cameras, expires, fingerprint, revoked: false };
         let port = self.address(role).port();
         let connect = self.list.hosts.iter().map(|host| host_and_port(host, port)).collect();
         let topic_name = self.topic_name(number);
         let authority = self.authority.certificate.clone();
-        let file = KeyFile::new(&self.list.rig, &holder, topic_name, connect, own_name(&self.list), authority, pair);
+        let key = KeyFile::new(&self.list.rig, &holder, topic_name, connect, own_name(&self.list), authority, pair);
         self.list.holders.push(holder);
         self.forget_oldest();
-        self.save()?;
-        Ok(file)
+        let Some(file) = file else { return self.save().map(|()| key) };
+        // Also before the note: a file that is there already is no half of this key.
+        if file.exists() {
+            return Err(already_there(file));
+        }
+        lock.begin(file).inspect_err(|_| lock.end())?;
+        let written = key.write_new(file).and_then(|()| self.save().inspect_err(|_| drop(std::fs::remove_file(file))));
+        lock.end();
+        written.map(|()| key)
     }
 
     /// Forgets the holders revoked longest ago: holders that are not listed are refused as well.
@@ -340,7 +474,16 @@ impl Ring {
             "# Keys of the rig '{}'. `flyrig keys` writes this file. `listen` may be changed: keys that were given away name its port.\n{body}",
             self.list.rig
         );
-        flyrig_types::write_whole(&path, |out| out.write_all(text.as_bytes()))
+        if text.len() as u64 > MAX_BYTES {
+            return Err(AccessError::file(&path, "would become too large; revoke keys, or give them fewer cameras"));
+        }
+        // A revocation outlasts a power failure.
+        let write = |out: &mut std::io::BufWriter<std::fs::File>| {
+            out.write_all(text.as_bytes())?;
+            out.flush()?;
+            out.get_ref().sync_all()
+        };
+        flyrig_types::write_whole(&path, write)
             .map_err(|error| AccessError::file(&path, format!("cannot be written ({error})")))
     }
 }
@@ -355,164 +498,45 @@ fn own_name(list: &List) -> String {
     format!("flyrig rig {} {}", list.rig, list.id)
 }
 
-fn check_hosts(hosts: &[String]) -> Result<(), AccessError> {
-    let good = |host: &String| {
-        host.parse::<std::net::IpAddr>().is_ok()
-            || (1..=253).contains(&host.len()) && host.bytes().all(|b| b.is_ascii_alphanumeric() || b"-.".contains(&b))
-    };
-    match hosts.iter().find(|host| !good(host)) {
-        None => Ok(()),
-        Some(host) => Err(AccessError::Request(format!(
-            "--host {host}: give a name or address without a port, such as rig.local or 10.0.0.5"
-        ))),
-    }
+/// Rights of a new key.
+struct Rights {
+    role: Role,
+    number: usize,
+    cameras: Vec<String>,
 }
 
-fn host_and_port(host: &str, port: u16) -> String {
-    if host.contains(':') { format!("[{host}]:{port}") } else { format!("{host}:{port}") }
+/// Returns the end of a key that is valid for `days` from now on, seconds since 1970.
+fn until(days: u64) -> Result<u64, AccessError> {
+    let is_good = (1..=36_500).contains(&days);
+    days.checked_mul(86_400)
+        .and_then(|secs| unix_secs().checked_add(secs))
+        .filter(|_| is_good)
+        .ok_or_else(|| AccessError::Request(format!("--days {days}: use 1 to 36500")))
+}
+
+/// Checks the cameras of a new key.
+fn check_cameras(role: Role, cameras: &[String]) -> Result<(), AccessError> {
+    if !cameras.is_empty() && role != Role::Cameras {
+        let text = format!("--camera: a key of role {} sends no cameras; add --role cameras", role.name());
+        return Err(AccessError::Request(text));
+    }
+    if cameras.len() > MAX_CAMERAS {
+        let text = format!("--camera: {} are too many; give at most {MAX_CAMERAS}", cameras.len());
+        return Err(AccessError::Request(text));
+    }
+    let is_good = |name: &String| {
+        (1..=64).contains(&name.len()) && name.bytes().all(|b| b.is_ascii_alphanumeric() || b"_.-".contains(&b))
+    };
+    match cameras.iter().find(|name| !is_good(name)) {
+        None => Ok(()),
+        Some(name) => {
+            let shown: String = name.chars().take(100).flat_map(char::escape_debug).collect();
+            Err(AccessError::Request(format!("--camera '{shown}': use 1 to 64 of the characters A-Z a-z 0-9 _ . -")))
+        }
+    }
 }
 
 #[cfg(test)]
 #[allow(clippy::unwrap_used)]
-mod tests {
-    use super::*;
-
-    fn new_ring() -> (tempfile::TempDir, Ring) {
-        let folder = tempfile::tempdir().unwrap();
-        let ring = Ring::create(&folder.path().join("keys"), "studio", &["rig.local".to_owned()], 7450).unwrap();
-        (folder, ring)
-    }
-
-    #[test]
-    fn a_ring_and_its_keys_come_back_as_they_were_made() {
-        let (folder, mut ring) = new_ring();
-        let desk = ring.add("desk", Role::Viewer, 30).unwrap();
-        let cameras = ring.add("left-pc", Role::Cameras, 30).unwrap();
-        assert_eq!(desk.connect, ["rig.local:7450"]);
-        assert_eq!(cameras.connect, ["rig.local:7451"]);
-        assert_ne!(desk.private_key, cameras.private_key);
-        let file = folder.path().join("desk.key");
-        desk.write_new(&file).unwrap();
-        assert_eq!(KeyFile::read(&file, &Role::ALL).unwrap(), desk);
-        assert!(!format!("{desk:?} {ring:?}").contains("PRIVATE"));
-        let again = Ring::open(ring.folder()).unwrap();
-        assert_eq!(again.holders(), ring.holders());
-        assert_eq!(again.authority().certificate, ring.authority().certificate);
-        #[cfg(unix)]
-        for secret in [file, ring.folder().join(AUTHORITY[1]), ring.folder().join(OWN[1])] {
-            let mode = std::fs::metadata(&secret).unwrap().permissions();
-            assert_eq!(std::os::unix::fs::PermissionsExt::mode(&mode) & 0o777, 0o600, "{}", secret.display());
-        }
-        // IPv6 addresses are written as such.
-        let hosts = ["fd00::1".to_owned(), "10.0.0.5".to_owned()];
-        let mut six = Ring::create(&folder.path().join("six"), "studio", &hosts, 9000).unwrap();
-        assert_eq!(six.add("a", Role::Relay, 1).unwrap().connect, ["[fd00::1]:9000", "10.0.0.5:9000"]);
-    }
-
-    #[test]
-    fn numbers_are_given_once_and_again_after_they_were_revoked() {
-        let (_folder, mut ring) = new_ring();
-        let names: Vec<String> =
-            (0..4).map(|n| ring.add(&format!("v{n}"), Role::Viewer, 1).unwrap().topic_name).collect();
-        assert!(names.iter().enumerate().all(|(n, name)| name.ends_with(&format!("-{n}"))), "{names:?}");
-        ring.revoke("v1").unwrap();
-        assert_eq!(ring.add("v4", Role::Viewer, 1).unwrap().topic_name, names[1]);
-        assert_eq!(ring.renew("v2", 1).unwrap().topic_name, names[2]);
-        // The same name again, after it was revoked.
-        assert!(ring.add("v1", Role::Viewer, 1).unwrap().topic_name.ends_with("-4"));
-        let valid: Vec<_> =
-            ring.holders().iter().filter(|of| !of.revoked).map(|of| (of.name.as_str(), of.number)).collect();
-        assert_eq!(valid, [("v0", 0), ("v3", 3), ("v4", 1), ("v2", 2), ("v1", 4)]);
-        for _ in 0..2 * MAX_REVOKED {
-            ring.renew("v0", 1).unwrap();
-        }
-        assert_eq!(ring.holders().len(), 5 + MAX_REVOKED, "the list does not grow for ever");
-        assert_eq!(Ring::open(ring.folder()).unwrap().holders(), ring.holders());
-        let prints: std::collections::BTreeSet<_> = ring.holders().iter().map(|of| of.fingerprint.clone()).collect();
-        assert_eq!(prints.len(), ring.holders().len());
-    }
-
-    #[test]
-    fn requests_that_are_not_possible_are_refused_in_words_and_change_nothing() {
-        let (folder, mut ring) = new_ring();
-        ring.add("desk", Role::Viewer, 1).unwrap();
-        let before = std::fs::read(ring.folder().join(LIST)).unwrap();
-        let words = |result: Result<(), AccessError>| result.unwrap_err().to_string();
-        for (result, part) in [
-            (ring.add("desk", Role::Cameras, 1).map(drop), "flyrig keys renew desk"),
-            (ring.add("a/b", Role::Viewer, 1).map(drop), "holder 'a/b'"),
-            (ring.add("", Role::Viewer, 1).map(drop), "holder ''"),
-            (ring.add("x", Role::Viewer, 0).map(drop), "--days 0"),
-            (ring.add("x", Role::Viewer, u64::MAX).map(drop), "use 1 to 36500"),
-            (ring.renew("x", 1).map(drop), "'x' has no key; known: desk"),
-            (ring.revoke("x"), "'x' has no key; known: desk"),
-        ] {
-            let text = words(result);
-            assert!(text.contains(part), "{text}");
-        }
-        assert_eq!(std::fs::read(ring.folder().join(LIST)).unwrap(), before);
-        let new = |name: &str, rig: &str, hosts: &[&str], port| {
-            let hosts: Vec<String> = hosts.iter().map(|host| (*host).to_owned()).collect();
-            words(Ring::create(&folder.path().join(name), rig, &hosts, port).map(drop))
-        };
-        assert!(new("keys", "studio", &["a"], 1).contains("is there already"));
-        assert!(new("b", "stu dio", &["a"], 1).contains("rig 'stu dio'"));
-        assert!(new("b", "studio", &[], 1).contains("--host"));
-        assert!(new("b", "studio", &["a:7450"], 1).contains("without a port"));
-        assert!(new("b", "studio", &["a"], 0).contains("--port 0"));
-        assert!(new("none/b", "studio", &["a"], 1).contains("cannot be made"));
-        assert_eq!(std::fs::read_dir(folder.path()).unwrap().count(), 1, "nothing half-made stays");
-    }
-
-    #[test]
-    fn damaged_rings_and_keys_are_named() {
-        let (folder, mut ring) = new_ring();
-        let key = folder.path().join("desk.key");
-        ring.add("desk", Role::Viewer, 1).unwrap().write_new(&key).unwrap();
-        let good = std::fs::read_to_string(&key).unwrap();
-        let words = |text: &[u8]| {
-            std::fs::write(&key, text).unwrap();
-            KeyFile::read(&key, &Role::ALL).unwrap_err().to_string()
-        };
-        for (text, part) in [
-            (String::new(), "is no key"),
-            ("x = ".to_owned(), "is no key"),
-            (good.replace("version = 1", "version = 2"), "version 2, this program knows 1; update"),
-            (good.replace("connect = [\"rig.local:7450\"]", "connect = []"), "is damaged"),
-            (good.replace("topic_name = \"", "topic_name = \"*/"), "is damaged"),
-            (good.replace("role = \"viewer\"", "role = \"king\""), "is damaged"),
-            (good.replacen("BEGIN CERTIFICATE", "BEGIN CERT", 1), "is damaged"),
-            (good.replace("BEGIN PRIVATE", "BEGIN PUBLIC"), "is damaged"),
-        ] {
-            let error = words(text.as_bytes());
-            assert!(error.contains("desk.key") && error.contains(part), "{part}: {error}");
-        }
-        assert!(words(&[0xff; 100]).contains("is no key"));
-        assert!(words(&vec![b'#'; 100_000]).contains("too large"));
-        std::fs::write(&key, &good).unwrap();
-        assert!(KeyFile::read(&key, &[Role::Cameras]).unwrap_err().to_string().contains("is a key of role viewer"));
-        // Every byte of a key and of a list, changed: an error or a key, never a panic.
-        let list = ring.folder().join(LIST);
-        let listed = std::fs::read(&list).unwrap();
-        for n in (0..good.len()).step_by(7) {
-            let mut bytes = good.clone().into_bytes();
-            bytes[n] = bytes[n].wrapping_add(n as u8 | 1);
-            std::fs::write(&key, &bytes).unwrap();
-            let _ = KeyFile::read(&key, &Role::ALL);
-        }
-        for n in 0..listed.len() {
-            let mut bytes = listed.clone();
-            bytes[n] = bytes[n].wrapping_add(n as u8 | 1);
-            std::fs::write(&list, &bytes).unwrap();
-            let _ = Ring::open(ring.folder());
-        }
-        std::fs::write(&list, "version = 1").unwrap();
-        assert!(Ring::open(ring.folder()).unwrap_err().to_string().contains("ring.toml: is no list of keys"));
-        std::fs::write(&list, &listed).unwrap();
-        std::fs::write(ring.folder().join(AUTHORITY[1]), "nothing").unwrap();
-        assert!(Ring::open(ring.folder()).unwrap_err().to_string().contains("authority-key.pem: is damaged"));
-        std::fs::remove_file(ring.folder().join(OWN[0])).unwrap();
-        std::fs::write(ring.folder().join(AUTHORITY[1]), "").unwrap();
-        assert!(Ring::open(&folder.path().join("none")).unwrap_err().to_string().contains("flyrig keys new"));
-    }
-}
+#[path = "ring_folder_tests.rs"]
+mod tests;

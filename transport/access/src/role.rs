@@ -8,7 +8,7 @@ use serde::{Deserialize, Serialize};
 pub enum Role {
     /// Viewer: receives people, views, statistics and calibration, and may have a viewpoint of its own. It publishes nothing.
     Viewer,
-    /// Computer with cameras: sends images. It receives nothing but queries of its clock.
+    /// Computer with cameras: sends images of the cameras that its key names. It receives nothing but queries of its own clock.
     Cameras,
     /// Relay: receives like a viewer, and may pass people on to viewers of its own.
     Relay,

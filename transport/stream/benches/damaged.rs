@@ -17,7 +17,7 @@ use flyrig_stream::{
 use rand::{RngExt as _, SeedableRng as _, rngs::StdRng};
 
 /// Largest run time, as a multiple of that of a valid message.
-const MOST_TIMES: f64 = 4.0;
+const MOST_TIMES: u32 = 4;
 /// Attempts at a slow input, of which the fastest counts: an attempt may be interrupted.
 const ATTEMPTS: usize = 5;
 const JOINTS: usize = 24;
@@ -107,7 +107,7 @@ fn run(name: &str, inputs: u64, valid: &[Vec<u8>], mut decode: impl FnMut(&[u8])
         let fastest = (0..ATTEMPTS).map(|_| time(&mut decode, message)).min();
         slowest_valid = slowest_valid.max(fastest.unwrap_or_default());
     }
-    let bound = slowest_valid.mul_f64(MOST_TIMES);
+    let bound = slowest_valid * MOST_TIMES;
     let mut random = StdRng::seed_from_u64(5);
     let (mut slowest, mut input, mut total) = (Duration::ZERO, Vec::new(), Duration::ZERO);
     for i in 0..inputs {

@@ -26,7 +26,7 @@ fn main() -> Result<(), Failure> {
     if let [word, endpoint, shared_memory, seconds] = arguments.as_slice()
         && word == "watch"
     {
-        let seconds = Duration::from_secs_f64(seconds.parse()?);
+        let seconds = flyrig_types::saturating_secs(seconds.parse()?);
         return watch(endpoint, shared_memory == "true", seconds);
     }
     let seconds: f64 = arguments.first().map_or(Ok(3.0), |seconds| seconds.parse())?;
@@ -159,9 +159,7 @@ fn watch(endpoint: &str, shared_memory: bool, seconds: Duration) -> Result<(), F
     let mut millis = Vec::new();
     let mut first = None;
     let start = Instant::now();
-    while first
-        .map_or(start.elapsed() < Duration::from_secs(20), |first: Instant| first.elapsed() < seconds.mul_f64(0.9))
-    {
+    while first.map_or(start.elapsed() < Duration::from_secs(20), |first: Instant| first.elapsed() < seconds * 9 / 10) {
         let view = subscriber.next_view(Duration::from_millis(5))?.map(|received| received.latency_nanos);
         let splats = subscriber.next_splats(Duration::ZERO)?.map(|received| received.latency_nanos);
         for nanos in [view, splats].into_iter().flatten() {

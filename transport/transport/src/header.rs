@@ -1,6 +1,10 @@
 //! Header that every message carries as its zenoh attachment.
 
-use crate::{error::TransportError, host::unix_nanos, schema::SCHEMA_VERSION};
+use crate::{
+    error::TransportError,
+    host::{monotonic_nanos, unix_nanos},
+    schema::SCHEMA_VERSION,
+};
 
 /// Bytes of an encoded [`Header`].
 pub const HEADER_BYTES: usize = 64;
@@ -46,6 +50,11 @@ impl MessageKind {
         Self::Colors,
     ];
 
+    /// Returns whether the header holds the size of an image; otherwise it holds the monotonic time in its place.
+    fn has_size(self) -> bool {
+        matches!(self, Self::View | Self::Frame)
+    }
+
     fn code(self) -> u8 {
         match self {
             Self::View => 1,
@@ -61,7 +70,8 @@ impl MessageKind {
     }
 }
 
-/// Message header with a fixed little-endian layout of 64 bytes: magic `FLYR`, version u16, kind u8, 0, then the fields in this order.
+/// Message header with a fixed little-endian layout of 64 bytes: magic `FLYR`, version u16, kind u8, 0, then the fields in
+/// this order, where `publish_nanos` takes the place of width and height in messages without an image.
 ///
 /// ```
 /// use flyrig_transport::{Header, MessageKind};
@@ -76,6 +86,7 @@ impl MessageKind {
 ///     publisher: 2,
 ///     width: 0,
 ///     height: 0,
+///     publish_nanos: 3_000_000_000,
 /// };
 /// assert_eq!(Header::decode("stats", &header.encode())?, header);
 /// # Ok::<(), flyrig_transport::TransportError>(())
@@ -90,16 +101,19 @@ pub struct Header {
     pub frame: u64,
     /// Capture time, `CLOCK_MONOTONIC` of the capturing host.
     pub capture_nanos: i64,
-    /// Time at which the message was handed to the publisher, by its wall clock, nanoseconds since 1970.
+    /// Time at which the message was handed to the publisher, by its wall clock, nanoseconds since 1970. That clock may be set at any
+    /// time: for display only.
     pub publish_unix_nanos: i64,
     /// Identity of the host since its boot: only within one host is the latency exact. 0 when unknown.
     pub host: u64,
     /// Identity of the publisher since its start.
     pub publisher: u64,
-    /// Width of a view, pixels; otherwise 0.
+    /// Width of an image, pixels; otherwise 0.
     pub width: u32,
-    /// Height of a view, pixels; otherwise 0.
+    /// Height of an image, pixels; otherwise 0.
     pub height: u32,
+    /// The time of `publish_unix_nanos` by `CLOCK_MONOTONIC` of that host; 0 for images, and from older programs.
+    pub publish_nanos: i64,
 }
 
 impl Header {
@@ -121,8 +135,12 @@ impl Header {
         for (at, word) in bytes[8..56].chunks_exact_mut(8).zip(words) {
             at.copy_from_slice(&word);
         }
-        bytes[56..60].copy_from_slice(&self.width.to_le_bytes());
-        bytes[60..].copy_from_slice(&self.height.to_le_bytes());
+        if self.kind.has_size() {
+            bytes[56..60].copy_from_slice(&self.width.to_le_bytes());
+            bytes[60..].copy_from_slice(&self.height.to_le_bytes());
+        } else {
+            bytes[56..].copy_from_slice(&self.publish_nanos.to_le_bytes());
+        }
         bytes
     }
 
@@ -147,17 +165,27 @@ impl Header {
         let short = || malformed("the header is cut short".to_owned());
         let [code, _reserved] = reader.take::<2>().ok_or_else(short)?;
         let kind = MessageKind::ALL.into_iter().find(|kind| kind.code() == code);
+        let kind = kind.ok_or_else(|| malformed(format!("message kind {code} is not known")))?;
         let mut word = || reader.take::<8>().ok_or_else(short);
-        Ok(Self {
-            kind: kind.ok_or_else(|| malformed(format!("message kind {code} is not known")))?,
+        let header = Self {
+            kind,
             sequence: u64::from_le_bytes(word()?),
             frame: u64::from_le_bytes(word()?),
             capture_nanos: i64::from_le_bytes(word()?),
             publish_unix_nanos: i64::from_le_bytes(word()?),
             host: u64::from_le_bytes(word()?),
             publisher: u64::from_le_bytes(word()?),
-            width: u32::from_le_bytes(reader.take().ok_or_else(short)?),
-            height: u32::from_le_bytes(reader.take().ok_or_else(short)?),
+            width: 0,
+            height: 0,
+            publish_nanos: 0,
+        };
+        let last = word()?;
+        Ok(if kind.has_size() {
+            let [w0, w1, w2, w3, h0, h1, h2, h3] = last;
+            let (width, height) = (u32::from_le_bytes([w0, w1, w2, w3]), u32::from_le_bytes([h0, h1, h2, h3]));
+            Self { width, height, ..header }
+        } else {
+            Self { publish_nanos: i64::from_le_bytes(last), ..header }
         })
     }
 }
@@ -174,6 +202,7 @@ pub(crate) fn empty_header() -> Header {
         publisher: 0,
         width: 0,
         height: 0,
+        publish_nanos: monotonic_nanos(),
     }
 }
 
@@ -195,7 +224,7 @@ mod tests {
 
     fn header() -> Header {
         Header {
-            kind: MessageKind::Splats,
+            kind: MessageKind::View,
             sequence: u64::MAX,
             frame: 7,
             capture_nanos: -5,
@@ -204,12 +233,16 @@ mod tests {
             publisher: 3,
             width: 640,
             height: u32::MAX,
+            publish_nanos: 0,
         }
     }
 
     #[test]
     fn a_header_survives_the_wire() {
-        assert_eq!(Header::decode("x", &header().encode()).unwrap(), header());
+        let timed = Header { kind: MessageKind::Motion, width: 0, height: 0, publish_nanos: i64::MIN + 7, ..header() };
+        for sent in [header(), timed] {
+            assert_eq!(Header::decode("x", &sent.encode()).unwrap(), sent);
+        }
     }
 
     #[test]

@@ -16,7 +16,7 @@ use crate::{
     error::{TransportError, TransportErrorKind},
     expected::{check_label, expected_payload},
     header::{self, Header, MessageKind},
-    host,
+    host::{self, Moment},
     keys::{self, MAX_PERSON_TOPICS},
     people::color_layers::ColorLayers,
     report::{Tally, TopicReport},
@@ -35,7 +35,7 @@ const MAX_ERRORS: usize = 16;
 pub(crate) struct Raw {
     pub header: Header,
     pub payload: Bytes,
-    /// Publisher's hand-in to arrival, by wall clocks.
+    /// Publisher's hand-in to arrival, by wall clocks where it came from another host.
     pub latency_nanos: i64,
     /// Whether both ends run on one host.
     pub exact: bool,
@@ -158,7 +158,9 @@ impl State {
 #[derive(Clone, Copy)]
 struct Observed {
     now: Instant,
-    /// Publisher's hand-in to arrival, by wall clocks.
+    /// Identity of the publisher's clock.
+    clock: u64,
+    /// Publisher's hand-in to arrival, by clocks that are never set; only differences of one `clock` mean something.
     latency_nanos: i64,
     /// Messages of the topic that were missed before it.
     missed: u64,
@@ -207,13 +209,13 @@ impl Inbox {
 
     /// Ingests a sample; runs on a zenoh thread.
     pub(crate) fn receive(&self, sample: &Sample) {
-        let (now, unix_nanos) = (Instant::now(), host::unix_nanos());
+        let now = Moment::now();
         let key = sample.key_expr().as_str();
         let attachment = sample.attachment().filter(|bytes| bytes.len() <= header::MAX_ATTACHMENT);
         let attachment = attachment.map(zenoh::bytes::ZBytes::to_bytes).unwrap_or_default();
         // The payload may lie in memory that the publisher takes back when we stall: copy it now.
         let (len, payload) = (sample.payload().len(), || Bytes::from(sample.payload().to_bytes().into_owned()));
-        if let Err(error) = self.accept(key, &attachment, len, payload, now, unix_nanos) {
+        if let Err(error) = self.accept(key, &attachment, len, payload, now) {
             self.refuse(error);
         }
     }
@@ -226,8 +228,7 @@ impl Inbox {
         attachment: &[u8],
         len: usize,
         payload: impl Fn() -> Bytes,
-        now: Instant,
-        unix_nanos: i64,
+        now: Moment,
     ) -> Result<(), TransportError> {
         let header = Header::decode(key, attachment)?;
         let label = keys::label_in(key).unwrap_or_default();
@@ -248,12 +249,17 @@ impl Inbox {
         let slot = state.slots.entry(label.to_owned()).or_default();
         slot.arrival = arrival;
         let exact = self.host != 0 && header.host == self.host;
-        let latency_nanos = unix_nanos.saturating_sub(header.publish_unix_nanos);
+        let by_wall = now.unix_nanos.saturating_sub(header.publish_unix_nanos);
+        // Older programs do not say when they sent by a clock that is never set.
+        let steady = (header.publish_nanos != 0).then(|| now.monotonic_nanos.saturating_sub(header.publish_nanos));
+        let latency_nanos = steady.filter(|_| exact).unwrap_or(by_wall);
         let missed_before = slot.tally.totals.missed;
-        slot.tally.add(&header, payload.len(), now, latency_nanos, exact);
+        slot.tally.add(&header, payload.len(), now.instant, latency_nanos, exact);
         slot.tally.totals.replaced += u64::from(is_replaced);
         let missed = slot.tally.totals.missed.saturating_sub(missed_before);
-        self.observe_line(label, header.kind, payload.len(), Observed { now, latency_nanos, missed });
+        let clock = if header.host == 0 { header.publisher } else { header.host };
+        let observed = Observed { now: now.instant, clock, latency_nanos: steady.unwrap_or(by_wall), missed };
+        self.observe_line(label, header.kind, payload.len(), observed);
         slot.raw = waits.then_some(Raw { header, payload, latency_nanos, exact });
         drop(state);
         self.changed.notify_all();
@@ -285,7 +291,7 @@ impl Inbox {
         let mut layers = lock(&self.color_layers);
         layers.count(keys::person_in(label).and_then(|(_, layer)| layer), bytes);
         if kind == MessageKind::Motion {
-            layers.motion(observed.now, observed.latency_nanos, observed.missed);
+            layers.motion(observed.now, observed.clock, observed.latency_nanos, observed.missed);
         }
     }
 
@@ -375,7 +381,7 @@ impl Inbox {
         timeout: Duration,
         mut ready: impl FnMut(&mut State) -> Option<T>,
     ) -> Result<Option<T>, TransportError> {
-        let deadline = Instant::now() + timeout;
+        let deadline = flyrig_types::deadline_after(timeout);
         let mut state: MutexGuard<'_, State> = lock(&self.state);
         loop {
             if !state.erred
@@ -432,11 +438,11 @@ mod tests {
 
     fn put_bytes(inbox: &Inbox, key: &str, kind: MessageKind, len: usize) -> Result<(), TransportError> {
         let header = Header { kind, ..empty_header() };
-        inbox.accept(key, &header.encode(), len, || vec![7; len].into(), Instant::now(), 0)
+        inbox.accept(key, &header.encode(), len, || vec![7; len].into(), Moment::now())
     }
 
     fn put(inbox: &Inbox, key: &str, header: &Header) -> Result<(), TransportError> {
-        inbox.accept(key, &header.encode(), 1, || Bytes::from_static(b"x"), Instant::now(), 0)
+        inbox.accept(key, &header.encode(), 1, || Bytes::from_static(b"x"), Moment::now())
     }
 
     fn report(inbox: &Inbox, label: &str) -> TopicReport {
@@ -569,3 +575,7 @@ mod tests {
         assert_eq!(reported, MAX_ERRORS);
     }
 }
+
+#[cfg(test)]
+#[path = "inbox_clock_tests.rs"]
+mod clock_tests;

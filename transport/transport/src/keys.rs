@@ -113,6 +113,21 @@ pub(crate) fn status_label(camera: &CameraId) -> String {
     format!("{STATUS}{camera}")
 }
 
+/// Returns the label under which a holder of a key sends what a program without a key sends under `label`.
+pub(crate) fn of_holder(label: &str, holder: &str) -> String {
+    format!("{label}/{holder}")
+}
+
+/// Returns the name in topics of a session of a key's holder, whose rights its first part selects.
+pub(crate) fn session_name(topic_name: &str, session: &str) -> String {
+    format!("{topic_name}.{session}")
+}
+
+/// Returns the holder's part of the name of one of its sessions; `None` for a program without a key.
+pub(crate) fn holder_in(name: &str) -> Option<&str> {
+    name.split_once('.').map(|(holder, _)| holder)
+}
+
 /// Key expression of the liveliness of computers with cameras, of any rig and schema version.
 pub(crate) const ANY_HOST: &str = "flyrig/*/*/host/*";
 
@@ -150,6 +165,8 @@ mod tests {
         assert_eq!(name_in("flyrig/v1/studio/viewer/ab12/view", "viewer", "/alive"), None);
         assert_eq!(name_in("flyrig/v1", "view", ""), None);
         assert_eq!(version_in("flyrig/v7/studio/alive/x"), Some("v7"));
+        assert_eq!(holder_in(&session_name("ab12-3", "7f")), Some("ab12-3"));
+        assert_eq!(holder_in("7f"), None);
     }
 
     #[test]

@@ -23,7 +23,7 @@ use crate::{
     people::person_stream::{PersonMessage, PublishedPeople, answer_templates},
     printable::printable,
     session::{
-        config::{LARGEST_QUESTION, TransportConfig},
+        config::{LARGEST_QUESTION, Side, TransportConfig},
         opening::{self, Opened},
     },
     stats::RigStats,
@@ -93,13 +93,14 @@ impl Publisher {
         config.validate()?;
         let rig = &config.rig;
         let Opened { session, endpoints, gate } =
-            opening::open(config, LARGEST_QUESTION, &[Role::Viewer, Role::Relay])?;
+            opening::open(config, Side::Sender, LARGEST_QUESTION, &[Role::Viewer, Role::Relay])?;
         let failed = |error: zenoh::Error| TransportError::session(format!("publisher of rig {rig}"), &error);
 
         let splats = Arc::new(Topic::new("splats".to_owned(), "splats".to_owned(), MessageKind::Splats));
         let stats = Arc::new(Topic::new("stats".to_owned(), "stats".to_owned(), MessageKind::Stats));
         let lease = Duration::from_millis(config.viewpoint_lease_millis);
-        let leases = Leases::new(config.max_viewers, lease, config.viewpoint_pixels_per_second);
+        let leases =
+            Leases::new(config.max_viewers, lease, config.viewpoint_pixels_per_second).with_keys(gate.is_some());
         let people = Arc::new(PublishedPeople::new());
         let mut topics = vec![splats.clone(), stats.clone()];
         topics.extend(people.first_topics());

@@ -19,7 +19,7 @@ use crate::{
     },
     report::TopicReport,
     session::{
-        config::{LARGEST_QUESTION, TransportConfig},
+        config::{LARGEST_QUESTION, Side, TransportConfig},
         opening::{self, Opened},
     },
     stats::RigStats,
@@ -63,9 +63,9 @@ pub struct Received<T> {
     pub topic: String,
     /// Header of the message.
     pub header: Header,
-    /// Time from the publisher's hand-in to the receipt here, by wall clocks; may be negative between hosts.
+    /// Time from the publisher's hand-in to the receipt here; between hosts and for images by wall clocks, where it may be negative.
     pub latency_nanos: i64,
-    /// Whether both ends run on one host, so that the latency is exact unless the clock is set meanwhile.
+    /// Whether both ends run on one host, so that the latency is exact; that of images unless the wall clock is set meanwhile.
     pub latency_is_exact: bool,
     /// Decoded message.
     pub body: T,
@@ -112,9 +112,9 @@ impl Subscriber {
         let rig = &config.rig;
         let failed = |error: zenoh::Error| TransportError::session(format!("subscriber of rig {rig}"), &error);
         let largest = MAX_MESSAGE_BYTES.max(MAX_SPLAT_BYTES) + LARGEST_QUESTION;
-        let Opened { session, .. } = opening::open(config, largest, &[])?;
+        let Opened { session, .. } = opening::open(config, Side::Receiver, largest, &[])?;
         let id = session.zid().to_string();
-        let id = config.key.as_ref().map_or_else(|| id.clone(), |key| format!("{}.{id}", key.topic_name));
+        let id = config.key.as_ref().map_or_else(|| id.clone(), |key| keys::session_name(&key.topic_name, &id));
         let inbox = Arc::new(Inbox::new(format!("{VIEWER_PREFIX}{id}"), config.inbox_bytes));
 
         let mut labels = vec!["calibration/*".to_owned(), "transforms".to_owned(), format!("viewer/{id}/view")];
@@ -249,7 +249,7 @@ impl Subscriber {
     /// images arrive through [`Self::next_view`] as the view [`Self::viewpoint_view`].
     ///
     /// # Errors
-    /// `Config` when the camera is not valid, larger than 4096 pixels per side, or `max_fps` is not in 0..=1000.
+    /// `Config` when the camera is not valid, larger than 4096 pixels per side, or another number, `max_fps` included (0.01 to 1000), is out of its range.
     pub fn request_viewpoint(&self, camera: &Camera, max_fps: f64) -> Result<(), TransportError> {
         check_camera("our viewpoint", camera, max_fps)?;
         self.renewal.want(Some((camera.clone(), max_fps)));

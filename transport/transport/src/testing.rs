@@ -5,14 +5,14 @@ use std::time::{Duration, Instant};
 use zenoh::Session;
 
 use crate::session::{
-    config::TransportConfig,
+    config::{Side, TransportConfig},
     opening::{self, Opened},
 };
 
 /// Opens a session that listens on a free port of loopback.
 pub(crate) fn loopback_session() -> Session {
     let config = TransportConfig { listen: vec!["tcp/127.0.0.1:0".to_owned()], ..TransportConfig::default() };
-    let Opened { session, .. } = opening::open(&config, 1 << 16, &[]).unwrap();
+    let Opened { session, .. } = opening::open(&config, Side::Receiver, 1 << 16, &[]).unwrap();
     session
 }
 

@@ -108,7 +108,7 @@ impl Topic {
         header.kind = self.kind;
         header.sequence = state.sequence;
         if header.host == 0 {
-            header.publish_unix_nanos = host::unix_nanos();
+            (header.publish_unix_nanos, header.publish_nanos) = (host::unix_nanos(), host::monotonic_nanos());
         }
         state.sequence += 1;
         state.counts.offered += 1;

@@ -4,7 +4,7 @@ use std::{
     convert::Infallible,
     net::{IpAddr, Ipv4Addr, Ipv6Addr, SocketAddr, UdpSocket},
     sync::{
-        Arc,
+        Arc, Mutex,
         atomic::{AtomicBool, Ordering},
     },
     time::Duration,
@@ -12,7 +12,7 @@ use std::{
 
 use flyrig_access::{Bounds, Connection, Listener, Serve};
 use flyrig_transport::TransportConfig;
-use flyrig_types::{SupervisedThread, ThreadHealth};
+use flyrig_types::{SupervisedThread, ThreadHealth, lock};
 use http_body_util::Full;
 use hyper::{
     Method, Request, Response, StatusCode,
@@ -20,6 +20,7 @@ use hyper::{
     header::{CONNECTION, CONTENT_TYPE, HeaderName, HeaderValue, SEC_WEBSOCKET_ACCEPT, SEC_WEBSOCKET_KEY, UPGRADE},
     server::conn::http1,
     service::service_fn,
+    upgrade::{OnUpgrade, Upgraded},
 };
 use hyper_util::rt::{TokioIo, TokioTimer};
 use tokio::{
@@ -47,7 +48,9 @@ const PATIENCE: Duration = Duration::from_secs(2);
 const TLS_HANDSHAKE: u8 = 22;
 /// Largest request, bytes; the smallest bound that hyper takes.
 const REQUEST_BYTES: usize = 8192;
-/// Largest number of connections at a time; further ones wait in the system's queue.
+/// Time limit from the connection to the end of the answer: the largest file at 32 kB/s, a hundredth of what the stream needs.
+const LONGEST: Duration = Duration::from_secs(10);
+/// Largest number of connections at a time, browsers included; further ones end those that show no token.
 const CONNECTIONS: usize = 512;
 /// Headers of every answer: the page loads nothing from elsewhere, and no other page frames it.
 const HEADERS: [(&str, &str); 5] = [
@@ -207,24 +210,29 @@ fn reachable(is_ipv4: bool, addresses: Vec<IpAddr>) -> Option<IpAddr> {
 
 impl Serve for Shared {
     async fn serve(self: Arc<Self>, connection: Connection) {
-        let Connection { stream, place: _place, .. } = connection;
-        // A malformed request costs its client alone.
-        let _ = greet(stream, self).await;
+        let Connection { stream, mut place, .. } = connection;
+        // A malformed request, or a client that reads slowly, costs that client alone.
+        if let Ok(Some(upgraded)) = timeout(LONGEST, greet(stream, &self)).await {
+            socket::serve(upgraded, &self.hub, &self.token, self.max_browsers, &mut place).await;
+        }
     }
 }
 
-/// Serves a client, through TLS where there is a certificate.
-async fn greet(client: TcpStream, shared: Arc<Shared>) -> hyper::Result<()> {
+/// Answers a client, through TLS where there is a certificate; returns its WebSocket where it asked for one.
+async fn greet(client: TcpStream, shared: &Arc<Shared>) -> Option<Upgraded> {
     let Some(tls) = shared.tls.clone() else { return answer(client, shared).await };
     let mut first = [0];
     match timeout(PATIENCE, client.peek(&mut first)).await {
         Ok(Ok(1)) if first == [TLS_HANDSHAKE] => {}
-        Ok(Ok(1)) => return refuse_http(client).await,
-        _ => return Ok(()),
+        Ok(Ok(1)) => {
+            let _ = refuse_http(client).await;
+            return None;
+        }
+        _ => return None,
     }
     match timeout(PATIENCE, tls.accept(client)).await {
         Ok(Ok(client)) => answer(client, shared).await,
-        _ => Ok(()),
+        _ => None,
     }
 }
 
@@ -243,13 +251,15 @@ async fn refuse_http(client: TcpStream) -> hyper::Result<()> {
     connection.serve_connection(TokioIo::new(client), service).await
 }
 
-async fn answer<C>(client: C, shared: Arc<Shared>) -> hyper::Result<()>
+async fn answer<C>(client: C, shared: &Arc<Shared>) -> Option<Upgraded>
 where
     C: AsyncRead + AsyncWrite + Unpin + Send + 'static,
 {
+    let upgrade = Arc::<Mutex<Option<OnUpgrade>>>::default();
+    let (shared, to_upgrade) = (Arc::clone(shared), Arc::clone(&upgrade));
     let service = service_fn(move |request| {
-        let shared = Arc::clone(&shared);
-        async move { Ok::<_, Infallible>(respond(request, &shared)) }
+        let response = respond(request, &shared, &to_upgrade);
+        async move { Ok::<_, Infallible>(response) }
     });
     http1::Builder::new()
         .timer(TokioTimer::new())
@@ -258,9 +268,17 @@ where
         .serve_connection(TokioIo::new(client), service)
         .with_upgrades()
         .await
+        .ok()?;
+    let upgrade = lock(&upgrade).take()?;
+    upgrade.await.ok()
 }
 
-fn respond(mut request: Request<Incoming>, shared: &Arc<Shared>) -> Response<Full<Bytes>> {
+/// Answers a request; one for the WebSocket leaves its upgrade in `to_upgrade`.
+fn respond(
+    mut request: Request<Incoming>,
+    shared: &Shared,
+    to_upgrade: &Mutex<Option<OnUpgrade>>,
+) -> Response<Full<Bytes>> {
     let scheme = if shared.tls.is_some() { "https" } else { "http" };
     if let Err(reason) = check_names(request.headers(), scheme, &shared.names) {
         return page(StatusCode::FORBIDDEN, "text/plain; charset=utf-8", Bytes::from(reason));
@@ -281,13 +299,7 @@ fn respond(mut request: Request<Incoming>, shared: &Arc<Shared>) -> Response<Ful
         let Some(accept) = key.and_then(|key| HeaderValue::from_str(&key).ok()) else {
             return text(StatusCode::UPGRADE_REQUIRED, "this address is for the page's WebSocket\n");
         };
-        let upgrade = hyper::upgrade::on(&mut request);
-        let shared = Arc::clone(shared);
-        tokio::spawn(async move {
-            if let Ok(upgraded) = upgrade.await {
-                socket::serve(upgraded, &shared.hub, &shared.token, shared.max_browsers).await;
-            }
-        });
+        *lock(to_upgrade) = Some(hyper::upgrade::on(&mut request));
         let mut response = Response::new(Full::default());
         *response.status_mut() = StatusCode::SWITCHING_PROTOCOLS;
         let headers = response.headers_mut();
@@ -319,6 +331,13 @@ fn page(status: StatusCode, kind: &'static str, body: Bytes) -> Response<Full<By
 #[allow(clippy::unwrap_used)]
 mod tests {
     use super::*;
+
+    #[test]
+    fn a_slow_line_has_time_for_the_largest_file() {
+        let largest = ["/", "/page.js", "/page.wasm", "/kernels.json"].map(|path| asset(path).unwrap().bytes.len());
+        let bytes_per_second = *largest.iter().max().unwrap() as f64 / (LONGEST - PATIENCE / 2).as_secs_f64();
+        assert!(bytes_per_second < 34e3, "{bytes_per_second}");
+    }
 
     #[test]
     fn an_address_that_others_reach_is_found_without_a_route() {

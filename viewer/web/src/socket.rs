@@ -2,6 +2,7 @@
 
 use std::{sync::Arc, time::Duration};
 
+use flyrig_access::ConnectionPlace;
 use futures_util::{SinkExt as _, StreamExt as _};
 use hyper::upgrade::Upgraded;
 use hyper_util::rt::TokioIo;
@@ -23,15 +24,21 @@ const SEND_PATIENCE: Duration = Duration::from_secs(20);
 /// Largest message of a browser, bytes.
 const LONGEST: usize = 1024;
 
-/// Serves a browser until it leaves.
-pub(crate) async fn serve(upgraded: Upgraded, hub: &Arc<Hub>, token: &Token, most: usize) {
+/// Serves a browser until it leaves; it keeps its place once it has shown the token.
+pub(crate) async fn serve(
+    upgraded: Upgraded,
+    hub: &Arc<Hub>,
+    token: &Token,
+    most: usize,
+    connection: &mut ConnectionPlace,
+) {
     let config = WebSocketConfig::default()
         .read_buffer_size(4096)
         .write_buffer_size(0)
         .max_message_size(Some(LONGEST))
         .max_frame_size(Some(LONGEST));
     let mut socket = WebSocketStream::from_raw_socket(TokioIo::new(upgraded), Role::Server, Some(config)).await;
-    let Some((code, reason)) = talk(&mut socket, hub, token, most).await else { return };
+    let Some((code, reason)) = talk(&mut socket, hub, token, most, connection).await else { return };
     let close = CloseFrame { code, reason: reason.into() };
     // A browser that does not respond is closed all the same.
     let _ = timeout(TOKEN_PATIENCE, socket.close(Some(close))).await;
@@ -43,6 +50,7 @@ async fn talk(
     hub: &Arc<Hub>,
     token: &Token,
     most: usize,
+    connection: &mut ConnectionPlace,
 ) -> Option<(CloseCode, &'static str)> {
     let admitted = match timeout(TOKEN_PATIENCE, socket.next()).await {
         Ok(Some(Ok(Message::Text(given)))) => token.admits(&given),
@@ -55,6 +63,7 @@ async fn talk(
     let Some(place) = hub.join(most) else {
         return Some((CloseCode::Again, "all places are taken; try again later"));
     };
+    connection.established();
     loop {
         tokio::select! {
             received = socket.next() => match received {

@@ -361,3 +361,79 @@ fn half_open_connections_and_floods_delay_no_other() {
     let ended = (0..100).any(|_| matches!(socket.read(), Err(_) | Ok(Message::Close(_))));
     assert!(ended);
 }
+
+/// Asks for the page and returns how long the answer took.
+fn page_time(address: SocketAddr) -> Duration {
+    let started = Instant::now();
+    let answer = ask(address, "GET / HTTP/1.1\r\nHost: localhost\r\n\r\n");
+    assert!(answer.starts_with("HTTP/1.1 200"), "{answer}");
+    started.elapsed()
+}
+
+/// Opens connections on which a request is sent, and little or nothing read.
+fn requests(address: SocketAddr, count: usize, request: &str) -> Vec<TcpStream> {
+    let open = |_| {
+        let mut stream = TcpStream::connect(address).ok()?;
+        stream.write_all(request.as_bytes()).ok()?;
+        stream.set_nonblocking(true).ok()?;
+        Some(stream)
+    };
+    (0..count).filter_map(open).collect()
+}
+
+#[test]
+fn clients_that_read_slowly_or_not_at_all_delay_no_other() {
+    let server = server("tcp/127.0.0.1:1", "127.0.0.1:0", false);
+    let address = server.address();
+    let mut slow = requests(address, 600, "GET /page.wasm HTTP/1.1\r\nHost: localhost\r\n\r\n");
+    assert!(slow.len() > 540, "{}: raise the limit of open files", slow.len());
+    for _ in 0..20 {
+        let took = page_time(address);
+        assert!(took < Duration::from_secs(1), "{took:?}");
+        // Half of them read a byte at a time.
+        slow.iter_mut().step_by(2).for_each(|stream| drop(stream.read(&mut [0])));
+        std::thread::sleep(Duration::from_millis(50));
+    }
+}
+
+#[test]
+fn an_answer_that_is_not_read_ends() {
+    let server = server("tcp/127.0.0.1:1", "127.0.0.1:0", false);
+    let mut deaf = TcpStream::connect(server.address()).unwrap();
+    deaf.write_all(b"GET /page.wasm HTTP/1.1\r\nHost: localhost\r\n\r\n").unwrap();
+    std::thread::sleep(Duration::from_secs(11));
+    let mut answer = Vec::new();
+    let _ = deaf.read_to_end(&mut answer);
+    assert!(answer.starts_with(b"HTTP/1.1 200") && answer.len() < 200_000, "{} bytes", answer.len());
+}
+
+#[test]
+fn sockets_without_a_token_are_bounded_and_delay_no_other() {
+    let server = server("tcp/127.0.0.1:1", "127.0.0.1:0", false);
+    let address = server.address();
+    let mut watching = browser(address, "");
+    let upgrade = "GET /stream HTTP/1.1\r\nHost: localhost\r\nUpgrade: websocket\r\nConnection: Upgrade\r\n\
+                   Sec-WebSocket-Version: 13\r\nSec-WebSocket-Key: AAAAAAAAAAAAAAAAAAAAAA==\r\n\r\n";
+    let mut silent = requests(address, 900, upgrade);
+    assert!(silent.len() > 800, "{}: raise the limit of open files", silent.len());
+    assert!(page_time(address) < Duration::from_secs(1));
+    let is_open = |stream: &mut TcpStream| loop {
+        match stream.read(&mut [0; 512]) {
+            Ok(0) => break false,
+            Ok(_) => {}
+            Err(error) => break error.kind() == std::io::ErrorKind::WouldBlock,
+        }
+    };
+    let open = silent.iter_mut().filter_map(|stream| is_open(stream).then_some(())).count();
+    assert!(open > 0 && open < 512, "{open}");
+    // One that has shown its token stays, and another is let in.
+    watching.send(Message::Ping(Default::default())).unwrap();
+    assert!(std::iter::repeat_with(|| watching.read().unwrap()).take(1000).any(|message| message.is_pong()));
+    next(&mut browser(address, ""));
+    // Without a token they end by themselves.
+    let deadline = Instant::now() + Duration::from_secs(20);
+    while silent.iter_mut().any(is_open) {
+        assert!(Instant::now() < deadline, "sockets without a token stay open");
+        std::thread::sleep(Duration::from_millis(100));
+    }
+}

@@ -74,7 +74,7 @@ pub fn capture(args: &BenchCaptureArgs) -> Result<()> {
     let clock = host_clock();
     let mut intake =
         Intake::start(cameras(args)?, InputFormat::AnySize, &SyncSettings::default(), Pacing::AsDelivered)?.live();
-    let run = Duration::from_secs_f64(args.minutes * 60.0);
+    let run = flyrig_types::saturating_secs(args.minutes * 60.0);
     let sets = (run.as_secs_f64() * args.rig.fps * 1.1) as usize;
     // All of its memory is taken before the measurement.
     let mut latencies_us: Vec<u32> = vec![0; sets.max(16)];

@@ -111,7 +111,7 @@ fn run(args: &BenchRecordArgs, quality: u8, path: &Path, pictures: &Arc<Vec<Vec<
     }
     let threads = CaptureThreads::start(sources, ThreadsConfig::default())?;
     let (before, started) = (cpu_ticks(), Instant::now());
-    let run = Duration::from_secs_f64(args.seconds);
+    let run = flyrig_types::saturating_secs(args.seconds);
     while started.elapsed() < run && !stop.load(Ordering::Relaxed) {
         // Recorded on their way; here they are only taken out.
         let _ = threads.queue().pop(Duration::from_millis(100));

@@ -24,7 +24,7 @@ pub struct AvatarExportArgs {
     /// The file to write: splats as *.ply, or as *.glb (KHR_gaussian_splatting); the texture as *.png.
     #[arg(long)]
     pub out: PathBuf,
-    /// Write a textured mesh with bones (*.glb) instead of splats, animated by --motion.
+    /// Write a textured mesh of the clothed surface with bones (*.glb) instead of splats, animated by --motion.
     #[arg(long)]
     pub mesh: bool,
     /// Motion that poses it (BVH or glTF); the rest pose otherwise.
@@ -82,8 +82,10 @@ fn encode(atlas: &Atlas) -> Result<Vec<u8>> {
 fn mesh(avatar: &Avatar, args: &AvatarExportArgs) -> Result<()> {
     let texture = encode(&avatar.atlas(args.resolution.side)?)?;
     let track = args.motion.as_deref().map(|path| y_up(&motion(avatar, path)?)).transpose()?;
-    write_glb(&args.out, &avatar.template, GlbContents { track: track.as_ref(), texture: Some(&texture) })?;
-    let (vertices, joints) = (avatar.template.positions.len(), avatar.template.skeleton.joints().len());
+    let mut surface = avatar.surface();
+    surface.normals = avatar.template.normals_at(&surface.positions);
+    write_glb(&args.out, &surface, GlbContents { track: track.as_ref(), texture: Some(&texture) })?;
+    let (vertices, joints) = (surface.positions.len(), surface.skeleton.joints().len());
     println!("textured mesh of {vertices} vertices with {joints} joints in {}", args.out.display());
     Ok(())
 }
@@ -137,4 +139,47 @@ pub(super) fn read_texture(path: &Path, side: u32) -> Result<Atlas> {
         path.display()
     );
     Ok(Atlas { side, rgb: image.into_raw(), covered: 0 })
+}
+
+#[cfg(test)]
+mod tests {
+    use flyrig_body::{
+        DEFAULT_SIGMA2_M2, ShapeParams, build_graph, default_template, load_gltf, sample_surface, skin_mesh,
+    };
+    use flyrig_renderer::HarmonicOrder;
+    use glam::DVec3;
+
+    use super::*;
+
+    #[test]
+    fn the_mesh_is_the_clothed_surface() {
+        let folder = tempfile::tempdir().unwrap();
+        let [avatar_path, out] = ["a.flyavatar", "a.glb"].map(|name| folder.path().join(name));
+        let template = default_template(&ShapeParams::default()).unwrap();
+        let gaussians = sample_surface(&template, 2000, 5).unwrap();
+        let graph = build_graph(&template, &gaussians, 60, DEFAULT_SIGMA2_M2).unwrap();
+        let mut avatar = Avatar::new(&template, &gaussians, Some(&graph), &[], HarmonicOrder::Zero).unwrap();
+        // Clothes that stand off by 5 cm to the front.
+        for mean in &mut avatar.hanging.as_mut().unwrap().mean {
+            *mean = DVec3::Z * 0.05;
+        }
+        write_whole(&avatar_path, &avatar.to_bytes().unwrap()).unwrap();
+        export(&AvatarExportArgs {
+            avatar: avatar_path,
+            out: out.clone(),
+            mesh: true,
+            motion: None,
+            frame: 0,
+            resolution: TextureArgs { side: 32 },
+        })
+        .unwrap();
+        let written = load_gltf(&out).unwrap().template;
+        let at_rest = |template: &flyrig_body::Template| skin_mesh(template, &template.skeleton.rest_pose()).0;
+        for ((clothed, found), body) in
+            at_rest(&avatar.surface()).iter().zip(at_rest(&written)).zip(at_rest(&avatar.template))
+        {
+            assert!(clothed.distance(found) < 1e-4, "{found} is not {clothed}");
+            assert!((found - body).z > 0.04, "{found} lies on the body, {body}");
+        }
+    }
 }

@@ -8,7 +8,7 @@ use std::{
 use anyhow::{Context as _, Result, bail};
 use clap::Args;
 use flyrig_avatar::{Avatar, DetailedScene};
-use flyrig_body::{RetargetOptions, load_bvh, load_gltf};
+use flyrig_body::{RetargetOptions, load_bvh, load_gltf_motion};
 use flyrig_gpu::GpuContext;
 use flyrig_report::{
     arguments::{parse_range, parse_size},
@@ -77,7 +77,7 @@ pub(super) fn motion(avatar: &Avatar, path: &Path) -> Result<PoseTrack> {
     let ending = path.extension().map(|ending| ending.to_string_lossy().to_lowercase()).unwrap_or_default();
     let clip = match ending.as_str() {
         "bvh" => load_bvh(path)?.motion(),
-        "glb" | "gltf" => load_gltf(path)?.motion()?,
+        "glb" | "gltf" => load_gltf_motion(path)?,
         _ => bail!("{} is neither BVH nor glTF (*.bvh, *.glb, *.gltf)", path.display()),
     };
     let options = RetargetOptions { reach_m: Some(0.5), ..RetargetOptions::default() };

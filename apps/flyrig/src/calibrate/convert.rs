@@ -1,15 +1,21 @@
 //! `flyrig calibrate convert`: calibrations of other programs.
 
-use std::path::PathBuf;
+use std::path::{Path, PathBuf};
 
 use anyhow::{Context as _, Result, bail, ensure};
 use clap::Args;
 use flyrig_calib::{Format, save_lenses};
 use flyrig_capture::folder_image_size;
-use flyrig_types::ColorMatch;
+use flyrig_fusion::Upright;
+use flyrig_takes::person_up;
+use flyrig_types::{Camera, ColorMatch, Rig};
+use glam::DVec3;
 
 use super::output::refuse_existing;
 use crate::arguments::TargetArgs;
+
+/// Cosine of the angle between stated up and image up beyond which a camera is upside down.
+const UPSIDE_DOWN: f64 = 0.5;
 
 /// Arguments of `flyrig calibrate convert`.
 #[derive(Debug, Args)]
@@ -72,7 +78,10 @@ pub fn convert(args: &CalibrateConvertArgs) -> Result<()> {
         .with_context(|| format!("cannot create {}", args.target.out.display()))?;
     println!("from {}: {}", from.name(), from.conventions());
     println!("to {}: {}", args.to.name(), args.to.conventions());
-    let Some(rig) = rig else {
+    for warning in &imported.warnings {
+        println!("warning: {warning}");
+    }
+    let Some(mut rig) = rig else {
         if args.to != Format::Flyrig {
             bail!("{} holds lenses without poses; they can be written as flyrig's alone", input.display());
         }
@@ -92,13 +101,9 @@ pub fn convert(args: &CalibrateConvertArgs) -> Result<()> {
             camera.id, i.width, i.height, i.focal_px.x, at.x, at.y, at.z
         );
     }
-    if imported.up.is_none() {
-        let up = rig.world_up;
-        println!(
-            "up is {:.3} {:.3} {:.3}, if the cameras are held level; correct it in calibration.toml",
-            up.x, up.y, up.z
-        );
-    }
+    // EasyMocap's files do not state it either.
+    let is_stated = imported.up.is_some() && from != Format::EasyMocap;
+    check_up(&mut rig, is_stated, args.images.as_ref().unwrap_or(input));
     let lost = args.to != Format::Flyrig && args.to != Format::Kalibr;
     if lost && rig.cameras.iter().any(|camera| camera.time_offset_nanos != 0) {
         println!("warning: {} has no place for time offsets; they are left out", args.to.name());
@@ -110,4 +115,42 @@ pub fn convert(args: &CalibrateConvertArgs) -> Result<()> {
     let files = args.to.write(&args.target.out, &rig).inspect_err(|_| drop(std::fs::remove_dir(&args.target.out)))?;
     println!("{}: {}", args.target.out.display(), files.join(", "));
     Ok(())
+}
+
+/// Checks the up direction against the person in the images, where there are some: takes it from them where the file does not state
+/// it, and warns where they contradict the file.
+fn check_up(rig: &mut Rig, is_stated: bool, images: &Path) {
+    let person = if images.join("images").is_dir() { person_up(rig, images) } else { Ok(Upright::default()) };
+    let person = person.unwrap_or_else(|error| {
+        eprintln!("warning: up is not checked against the person in {}: {error:#}", images.display());
+        Upright::default()
+    });
+    let fault = person.fault(rig.world_up);
+    let source = match person.up() {
+        None if is_stated => return warn_of_cameras(rig),
+        None => "if the cameras are held level; correct it in calibration.toml",
+        Some(_) if fault.is_none() => "and the person in the images agrees",
+        Some(up) if !is_stated => {
+            rig.world_up = up;
+            "as the person in the images stands"
+        }
+        Some(_) => "as the file says, but see the warning",
+    };
+    let up = rig.world_up;
+    println!("up is {:.3} {:.3} {:.3}, {source}", up.x + 0.0, up.y + 0.0, up.z + 0.0);
+    if let Some(fault) = fault.filter(|_| is_stated) {
+        eprintln!("warning: {fault}");
+    }
+}
+
+/// Warns where the stated up direction is down in the cameras' images.
+fn warn_of_cameras(rig: &Rig) {
+    let above = |camera: &Camera| camera.camera_from_world.rotation.inverse() * DVec3::NEG_Y;
+    let below = rig.cameras.iter().filter(|camera| above(camera).dot(rig.world_up) < -UPSIDE_DOWN).count();
+    if below > 0 && below == rig.cameras.len() {
+        eprintln!(
+            "warning: the file's up direction is down in the images of all cameras: the world is upside down, or the cameras hang upside \
+             down; with --images FOLDER a person in its images tells"
+        );
+    }
 }

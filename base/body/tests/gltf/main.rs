@@ -10,6 +10,7 @@ use serde_json::{Value, json};
 use crate::file::{File, animate, armature, load_bytes};
 
 mod file;
+mod foreign;
 mod limits;
 
 fn near(found: Vec3, expected: Vec3) {
@@ -202,7 +203,7 @@ fn no_cut_of_a_file_panics() {
 
 /// Returns a skinned human of a rig with prefixes: legs down, arms along x, y up; in one second the left thigh turns by 90
 /// degrees to the front and the hips go 0.2 m along z.
-fn human(prefix: &str) -> File {
+pub fn human(prefix: &str) -> File {
     let mut file = File::new();
     let name = |joint: &str| format!("{prefix}{joint}");
     let node = |joint: &str, at: [f64; 3], children: &[usize]| match children {

@@ -83,7 +83,7 @@ struct Session {
 impl Session {
     fn silent_after(&self, fps: f64) -> Duration {
         if self.is_flowing {
-            SILENT_AFTER.max(Duration::from_secs_f64(SILENT_PERIODS / fps.clamp(0.1, 1e6)))
+            SILENT_AFTER.max(flyrig_types::saturating_secs(SILENT_PERIODS / fps.clamp(0.1, 1e6)))
         } else {
             FIRST_FRAME
         }

@@ -3,6 +3,7 @@
 mod course;
 mod opener;
 mod pulse;
+mod rate;
 mod run_stage;
 mod shared;
 mod stats;
@@ -17,6 +18,7 @@ use std::{
 use flyrig_types::{CameraId, Frame};
 
 pub use self::opener::SourceOpener;
+pub use self::rate::FrameRate;
 pub use self::stats::{CameraStats, Pacing, ThreadsConfig};
 use self::{
     opener::{How, Opening},
@@ -121,6 +123,7 @@ impl CaptureThreads {
             errors: BTreeMap::new(),
             last_error: None,
             health: SourceHealth::default(),
+            rate: None,
             restarts: 0,
             stage_restarts: 0,
             opened: false,

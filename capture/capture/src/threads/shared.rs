@@ -12,6 +12,7 @@ use super::{
     course::Course,
     opener::Opening,
     pulse::Pulse,
+    rate::RateMeter,
     stats::{CameraStats, Pacing},
 };
 use crate::error::{CaptureError, CaptureErrorKind};
@@ -103,7 +104,10 @@ impl ThreadsState {
             let Some(mut source) = source else { break };
             lock(&self.stats)[slot].opened = true;
             let end = caught(|| self.read(slot, &mut *source, &mut course));
-            lock(&self.stats)[slot].opened = false;
+            {
+                let mut stats = lock(&self.stats);
+                (stats[slot].opened, stats[slot].rate) = (false, None);
+            }
             // By itself: a source that is dropped while its own panic unwinds may panic again, which ends the process.
             let closed = caught(move || drop(source));
             if let Some(text) = end.as_ref().err().or(closed.as_ref().err()) {
@@ -195,17 +199,19 @@ impl ThreadsState {
 
     fn read(&self, slot: usize, source: &mut dyn CameraSource, course: &mut Course) -> End {
         let pulse = &self.pulses[slot].camera;
-        let (mut pause, mut failures) = (FIRST_PAUSE, 0);
+        let (mut pause, mut failures, mut rate) = (FIRST_PAUSE, 0, RateMeter::new());
         while !self.is_stopped() {
             pulse.beat();
             let result = source.next_frame(POLL);
             let health = course.health(source.health());
+            let mode_fps = health.mode_fps();
             lock(&self.stats)[slot].health = health;
             let error = match result {
                 Ok(mut frame) => {
                     (pause, failures) = (FIRST_PAUSE, 0);
                     let order_nanos = source.order_nanos(&frame);
                     course.number(&mut frame);
+                    lock(&self.stats)[slot].rate = rate.add(&frame, mode_fps);
                     // Before its stage: a reader that runs ahead would overtake all frames but the last.
                     if self.pacing == Pacing::RealTime {
                         self.pace(slot, frame.capture_nanos);
@@ -245,6 +251,10 @@ impl ThreadsState {
                     return End::Over;
                 }
                 continue;
+            }
+            if matches!(kind, CaptureErrorKind::Disconnected | CaptureErrorKind::Io) {
+                rate.reset();
+                lock(&self.stats)[slot].rate = None;
             }
             failures += 1;
             // What is read without loss does not come back with the wall clock's time.

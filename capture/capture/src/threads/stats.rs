@@ -6,6 +6,7 @@ use flyrig_types::CameraId;
 
 use crate::error::{CaptureError, CaptureErrorKind};
 use crate::source::SourceHealth;
+use crate::threads::rate::FrameRate;
 
 /// Timing of frames into the queue, and behaviour when it is full.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]
@@ -36,7 +37,7 @@ impl Default for ThreadsConfig {
 }
 
 /// Counts of one camera's threads.
-#[derive(Debug, Clone, PartialEq, Eq)]
+#[derive(Debug, Clone, PartialEq)]
 pub struct CameraStats {
     /// Name of the camera.
     pub camera: CameraId,
@@ -52,6 +53,8 @@ pub struct CameraStats {
     pub last_error: Option<CaptureError>,
     /// Health as the source reports it, summed over all sources of the camera.
     pub health: SourceHealth,
+    /// Rate at which the camera captures; `None` for the first three seconds, while it is gone, and where its mode is not known.
+    pub rate: Option<FrameRate>,
     /// Number of times that the camera was reopened because its source had failed for good or panicked.
     pub restarts: u64,
     /// Number of times that its stage was created anew after a panic.

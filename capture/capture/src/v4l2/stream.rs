@@ -267,7 +267,7 @@ impl<H: Host> Stream<H> {
 impl<D: BufferDevice> Session<D> {
     fn silent_after(&self) -> Duration {
         if self.is_flowing {
-            SILENT_AFTER.max(Duration::from_secs_f64(SILENT_PERIODS / self.fps.clamp(0.1, 1e6)))
+            SILENT_AFTER.max(flyrig_types::saturating_secs(SILENT_PERIODS / self.fps.clamp(0.1, 1e6)))
         } else {
             FIRST_FRAME
         }

@@ -3,6 +3,7 @@
 use std::path::Path;
 
 use flyrig_body::GlbWriter;
+use flyrig_model::srgb;
 use flyrig_renderer::{AnisotropicSplats, SH_DEGREE_0};
 use glam::{Quat, Vec3};
 use serde_json::{Map, Value, json};
@@ -13,7 +14,9 @@ const EXTENSION: &str = "KHR_gaussian_splatting";
 /// Constant that the extension adds to the sum of the harmonics.
 const BIAS: f32 = 0.5;
 
-/// Writes Gaussians as glTF, in linear colours of BT.709. `file_from_world` rotates them to y up, metres. Gaussians
+/// Writes Gaussians as glTF, in colours of sRGB, the space that viewers draw whatever the file says and that Gaussians of other programs
+/// are trained in. As in PLY files, the constant part of the harmonics is converted exactly and the others by the slope there. `COLOR_0`,
+/// for viewers without the extension, is linear, as glTF requires. `file_from_world` rotates them to y up, metres. Gaussians
 /// with a NaN or an infinity are skipped. Returns the number written.
 ///
 /// # Errors
@@ -42,14 +45,20 @@ pub fn write_splat_glb(path: &Path, splats: &AnisotropicSplats, file_from_world:
     add(format!("{EXTENSION}:OPACITY"), glb.floats(&opacities, "SCALAR", 1));
     for k in 0..coefficients {
         let (degree, index) = place(k);
-        let bias = if k == 0 { BIAS / SH_DEGREE_0 } else { 0.0 };
-        let values =
-            numbers(&|i| splats.harmonics[i * coefficients + k][..3].iter().map(|value| value - bias).collect());
+        let values = numbers(&|i| {
+            let constant = splats.harmonics[i * coefficients];
+            let own = splats.harmonics[i * coefficients + k];
+            let value = |c: usize| match k {
+                0 => (encode(SH_DEGREE_0 * constant[c]).0 - BIAS) / SH_DEGREE_0,
+                _ => own[c] * encode(SH_DEGREE_0 * constant[c]).1,
+            };
+            [0, 1, 2].map(value).to_vec()
+        });
         add(format!("{EXTENSION}:SH_DEGREE_{degree}_COEF_{index}"), glb.floats(&values, "VEC3", 3));
     }
     let extension = json!({
         "kernel": "ellipse",
-        "colorSpace": "lin_rec709_display",
+        "colorSpace": "srgb_rec709_display",
         "sortingMethod": "cameraDistance",
         "projection": "perspective",
     });
@@ -64,6 +73,12 @@ pub fn write_splat_glb(path: &Path, splats: &AnisotropicSplats, file_from_world:
         }),
     )?;
     Ok(kept.len())
+}
+
+/// sRGB value of a linear one and the slope there. The curve goes on above 1, and below 0 as above it.
+fn encode(linear: f32) -> (f32, f32) {
+    let x = linear.abs();
+    (srgb::encode(x, f32::powf).copysign(linear), srgb::slope(x, f32::powf))
 }
 
 /// Returns degree and index within the degree of a coefficient, in the renderer's order.
@@ -119,9 +134,24 @@ mod tests {
         near("POSITION", &[1.0, 2.0, 3.0]);
         near("KHR_gaussian_splatting:ROTATION", &[0.0, 0.0, 0.0, 1.0]);
         near("KHR_gaussian_splatting:OPACITY", &[0.5]);
-        let zero = BIAS / SH_DEGREE_0;
-        near("KHR_gaussian_splatting:SH_DEGREE_0_COEF_0", &[-zero, 0.5 - zero, 0.25 - zero]);
-        near("KHR_gaussian_splatting:SH_DEGREE_1_COEF_2", &[3.0, 0.5, 0.25]);
-        assert!(numbers("COLOR_0")[1] - 0.5 * SH_DEGREE_0 < 1e-6);
+        // The sum that the extension prescribes is the sRGB value; small changes of it are those of the linear value.
+        let curve = |linear: f32| match linear * SH_DEGREE_0 {
+            x if x <= 0.003_130_8 => 12.92 * x,
+            x => 1.055 * x.powf(1.0 / 2.4) - 0.055,
+        };
+        let slope = |linear: f32| (curve(linear + 1e-3) - curve(linear)) / (1e-3 * SH_DEGREE_0);
+        let sums = numbers("KHR_gaussian_splatting:SH_DEGREE_0_COEF_0");
+        for (sum, linear) in sums.iter().zip([0.0, 0.5, 0.25]) {
+            assert!((0.5 + SH_DEGREE_0 * sum - curve(linear)).abs() < 1e-5, "{sums:?}");
+        }
+        let varying = numbers("KHR_gaussian_splatting:SH_DEGREE_1_COEF_2");
+        for ((found, linear), base) in varying.iter().zip([3.0, 0.5, 0.25]).zip([0.0, 0.5, 0.25]) {
+            assert!((found / (linear * slope(base)) - 1.0).abs() < 0.01, "{varying:?}");
+        }
+        assert_eq!(
+            document["meshes"][0]["primitives"][0]["extensions"][EXTENSION]["colorSpace"],
+            json!("srgb_rec709_display")
+        );
+        assert!((numbers("COLOR_0")[1] - 0.5 * SH_DEGREE_0).abs() < 1e-6);
     }
 }

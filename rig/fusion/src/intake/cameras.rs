@@ -112,7 +112,7 @@ impl Intake {
 
     /// Waits for the next frame set. Returns `None` when none came in time or all cameras have ended (see [`Self::ended`]).
     pub fn next_set(&mut self, timeout: Duration) -> Option<FrameSet> {
-        let deadline = Instant::now() + timeout;
+        let deadline = flyrig_types::deadline_after(timeout);
         loop {
             self.ingest_waiting(deadline);
             if !self.every_set && self.ready.len() > 1 {
@@ -132,12 +132,13 @@ impl Intake {
         while !(self.ended || self.every_set && !self.ready.is_empty()) {
             match self.threads.queue().pop(wait) {
                 Ok(frame) => {
-                    self.time(&frame);
+                    let now_nanos = monotonic_nanos();
+                    self.time(&frame, now_nanos);
                     let frame = match &mut self.aligner {
                         Some(aligner) => aligner.align(frame),
                         None => frame,
                     };
-                    self.ready.extend(self.sync.push(frame));
+                    self.ready.extend(self.sync.push_at(frame, now_nanos));
                     wait = Duration::ZERO;
                 }
                 Err(PopError::Closed) => {
@@ -145,13 +146,27 @@ impl Intake {
                     self.ready.extend(self.sync.flush());
                 }
                 Err(PopError::Timeout) => {
+                    let overdue = self.give_up();
                     wait = deadline.saturating_duration_since(Instant::now());
                     if !self.ready.is_empty() || wait.is_zero() {
                         break;
                     }
+                    wait = overdue.map_or(wait, |overdue| wait.min(overdue));
                 }
             }
         }
+    }
+
+    /// Forms the live frame sets whose missing frames would have arrived by now. Returns the time until that is so for the next one; `None`
+    /// where only a frame completes it.
+    fn give_up(&mut self) -> Option<Duration> {
+        if self.every_set {
+            return None;
+        }
+        let now_nanos = monotonic_nanos();
+        self.ready.extend(self.sync.give_up(now_nanos));
+        let left = self.sync.next_deadline()?.saturating_sub(now_nanos);
+        Some(Duration::from_nanos(u64::try_from(left).unwrap_or(0)))
     }
 
     /// Declares that capture times are on this computer's clock, so that latency is measured.
@@ -161,10 +176,10 @@ impl Intake {
     }
 
     /// Updates the timing of a frame's camera.
-    fn time(&mut self, frame: &Frame) {
+    fn time(&mut self, frame: &Frame, now_nanos: i64) {
         self.timing.resize(self.cameras.len(), Timing::default());
         if let Some(slot) = self.cameras.iter().position(|camera| *camera == frame.camera) {
-            self.timing[slot].add(frame.capture_nanos, monotonic_nanos());
+            self.timing[slot].add(frame.capture_nanos, now_nanos);
         }
     }
 
@@ -248,4 +263,71 @@ fn camera_drops(camera: &CameraStats) -> Vec<(String, u64)> {
     drops.push((format!("errors of {}", camera.camera), camera.errors.values().sum()));
     drops.push((format!("frames of {} lost before us", camera.camera), camera.health.lost_by_driver));
     drops
+}
+
+#[cfg(test)]
+mod tests {
+    use flyrig_types::{Image, PixelFormat};
+
+    use super::*;
+
+    const PERIOD: Duration = Duration::from_millis(100);
+
+    /// Camera that captures for two seconds at a time, each followed by a pause in which nothing comes.
+    struct Paused {
+        camera: CameraId,
+        start: Instant,
+        next: u32,
+        /// Whether the last frame before each pause is lost.
+        loses_last: bool,
+    }
+
+    impl CameraSource for Paused {
+        fn camera(&self) -> &CameraId {
+            &self.camera
+        }
+
+        fn next_frame(&mut self, timeout: Duration) -> Result<Frame, CaptureError> {
+            let number = self.next;
+            // Twenty frames of every sixty.
+            let due = self.start + PERIOD * number;
+            let wait = due.saturating_duration_since(Instant::now());
+            std::thread::sleep(wait.min(timeout));
+            let is_late = || CaptureError::new(&self.camera, flyrig_capture::CaptureErrorKind::Timeout, "not yet");
+            if wait > timeout {
+                return Err(is_late());
+            }
+            self.next += 1;
+            let turn = number % 60;
+            if turn >= 20 || turn == 19 && self.loses_last {
+                return Err(is_late());
+            }
+            Ok(Frame {
+                camera: self.camera.clone(),
+                sequence: u64::from(number),
+                capture_nanos: i64::from(number) * PERIOD.as_nanos() as i64,
+                exposure_nanos: None,
+                image: Image::new(1, 1, PixelFormat::Rgb8, vec![0; 3]).unwrap(),
+                mask: None,
+            })
+        }
+    }
+
+    #[test]
+    fn a_set_without_a_lost_frame_comes_before_any_later_frame() {
+        let start = Instant::now();
+        let source = |name: &str, loses_last: bool| {
+            Box::new(Paused { camera: name.into(), start, next: 0, loses_last }) as Box<dyn CameraSource>
+        };
+        let sources = vec![source("a", false), source("b", true)];
+        let mut intake =
+            Intake::start(sources, InputFormat::Rgb, &SyncSettings::default(), Pacing::AsDelivered).unwrap();
+        // On a busy machine frames arrive irregularly, and a set may wait for the frames after the pause.
+        let is_early = (0..400).any(|_| {
+            let set = intake.next_set(Duration::from_millis(500));
+            let number = set.map(|set| set.master_nanos / PERIOD.as_nanos() as i64);
+            number.is_some_and(|number| number % 60 == 19 && start.elapsed() < PERIOD * (number as u32 + 35))
+        });
+        assert!(is_early, "every set waited for the frames after its pause");
+    }
 }

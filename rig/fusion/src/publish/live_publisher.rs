@@ -15,8 +15,9 @@ use flyrig_capture::{LatestQueue, PopError};
 use flyrig_renderer::composite_over;
 use flyrig_transport::{
     ImageFormat, Publisher, RigStats, SplatState, StageStats, SubjectStats, TrackingStats, ViewFrame, ViewRate,
+    Viewpoint,
 };
-use flyrig_types::{FrameSet, RenderedView, SupervisedThread, ThreadHealth};
+use flyrig_types::{FrameSet, RenderedView, SupervisedThread, ThreadHealth, caught};
 use image::{ExtendedColorType, ImageEncoder as _, codecs::jpeg::JpegEncoder};
 
 use super::person_publisher::PersonPublisher;
@@ -32,6 +33,8 @@ const STATS_EVERY: Duration = Duration::from_secs(1);
 /// View to compress and publish.
 struct ViewJob {
     view: String,
+    /// Viewer that has requested it; `None` for a view of the rig.
+    viewer: Option<String>,
     picture: RenderedView,
     frame: u64,
     capture_nanos: i64,
@@ -74,7 +77,7 @@ impl LivePublisher {
                 if std::mem::replace(&mut has_begun, true) {
                     failures.fetch_add(1, Ordering::Relaxed);
                 }
-                encode_all(&jobs, &failures, |job| encode(&publisher, job));
+                encode_all(&jobs, &failures, |job| encode_or_refuse(&publisher, job, &encode));
             };
             SupervisedThread::start("encode", work).map_err(|source| FusionError::Thread { name: "encode", source })?
         };
@@ -99,7 +102,16 @@ impl LivePublisher {
 
     /// Queues a rendered view. When compression is behind, the oldest waiting view is dropped and counted.
     pub fn publish(&self, view: &str, picture: RenderedView, set: &FrameSet) {
-        let job = ViewJob { view: view.to_owned(), picture, frame: set.index, capture_nanos: set.master_nanos };
+        self.queue(view, None, picture, set);
+    }
+
+    /// Queues a rendered view that a viewer has requested, as [`Self::publish`] does. A panic while it is compressed ends the viewpoint.
+    pub fn publish_viewpoint(&self, viewpoint: &Viewpoint, picture: RenderedView, set: &FrameSet) {
+        self.queue(&viewpoint.view, Some(viewpoint.subscriber.clone()), picture, set);
+    }
+
+    fn queue(&self, view: &str, viewer: Option<String>, picture: RenderedView, set: &FrameSet) {
+        let job = ViewJob { view: view.to_owned(), viewer, picture, frame: set.index, capture_nanos: set.master_nanos };
         drop(self.jobs.push(job));
     }
 
@@ -271,6 +283,20 @@ fn encode_all(
     }
 }
 
+/// Compresses one view; a panic at one that a viewer has requested ends that viewpoint alone.
+fn encode_or_refuse(
+    publisher: &Publisher,
+    job: &ViewJob,
+    encode: impl Fn(&Publisher, &ViewJob) -> Result<(), Box<dyn Error>>,
+) -> Result<(), Box<dyn Error>> {
+    let Some(viewer) = &job.viewer else { return encode(publisher, job) };
+    caught(|| encode(publisher, job)).unwrap_or_else(|panic| {
+        let error = FusionError::View(panic);
+        publisher.refuse_viewpoint(viewer, &error.to_string());
+        Err(error.into())
+    })
+}
+
 /// Compresses one view over the backdrop, and publishes it as JPEG.
 fn encode_one(publisher: &Publisher, job: &ViewJob, quality: u8) -> Result<(), Box<dyn Error>> {
     let RenderedView { width, height, rgba } = &job.picture;
@@ -295,6 +321,7 @@ fn encode_one(publisher: &Publisher, job: &ViewJob, quality: u8) -> Result<(), B
 #[cfg(test)]
 mod tests {
     use flyrig_transport::TransportConfig;
+    use flyrig_types::{Camera, Intrinsics, Isometry};
 
     use super::*;
 
@@ -334,6 +361,27 @@ mod tests {
         let panic = Some("frame 1".to_owned());
         assert_eq!(encoder, ThreadHealth { name: "encode".to_owned(), restarts: 1, panic, has_failed: false });
         assert_eq!(publisher.drops()[2], ("images that failed".to_owned(), 1));
+        publisher.finish().unwrap();
+    }
+
+    #[test]
+    fn a_panic_while_a_viewers_view_is_compressed_ends_that_viewpoint_alone() {
+        let config = TransportConfig { listen: vec!["tcp/127.0.0.1:0".to_owned()], ..TransportConfig::default() };
+        let publisher = Publisher::open(&config).unwrap();
+        let publisher = LivePublisher::start_with(publisher, |_, job| panic!("frame {}", job.frame)).unwrap();
+        let camera = Camera::new("mine", Intrinsics::pinhole(64, 64, 50.0), Isometry::IDENTITY);
+        let viewpoint = Viewpoint { subscriber: "a".to_owned(), view: "viewer-a".to_owned(), camera, max_fps: 30.0 };
+        for index in 0..100 {
+            let set = FrameSet { index, master_nanos: 0, frames: Vec::new() };
+            publisher.publish_viewpoint(&viewpoint, RenderedView { width: 1, height: 1, rgba: vec![0; 4] }, &set);
+            std::thread::sleep(Duration::from_millis(1));
+        }
+        let deadline = Instant::now() + Duration::from_secs(20);
+        while publisher.drops()[2].1 < 7 {
+            assert!(Instant::now() < deadline, "{:?}", publisher.drops());
+            std::thread::sleep(Duration::from_millis(10));
+        }
+        assert!(publisher.threads().iter().all(|thread| thread.restarts == 0), "{:?}", publisher.threads());
         publisher.finish().unwrap();
     }
 

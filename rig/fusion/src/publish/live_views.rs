@@ -3,7 +3,7 @@
 
 use std::time::{Duration, Instant};
 
-use flyrig_types::FrameSet;
+use flyrig_types::{Camera, FrameSet, RenderedView};
 use serde::{Deserialize, Serialize};
 
 use super::{live_publisher::LivePublisher, orbit::orbit};
@@ -55,6 +55,8 @@ pub struct LiveViews {
     names: Vec<String>,
     width: u32,
     height: u32,
+    /// Draws a requested view.
+    draw: fn(&mut Session, &Camera) -> Result<RenderedView, FusionError>,
 }
 
 impl LiveViews {
@@ -62,13 +64,14 @@ impl LiveViews {
     #[must_use]
     pub fn new(settings: &OutputSettings) -> Self {
         let name = |i: usize| if i == 0 { "main".to_owned() } else { format!("main-{i}") };
-        Self { names: (0..settings.views).map(name).collect(), width: settings.width, height: settings.height }
+        let names = (0..settings.views).map(name).collect();
+        Self { names, width: settings.width, height: settings.height, draw: Session::render }
     }
 
     /// Renders the watched views and hands them to the publisher. `at` turns the rig's own views. Returns the number of rendered views.
     ///
     /// # Errors
-    /// Faults of the graphics device and of the transport session. A requested view that cannot be rendered is no error.
+    /// Faults of the graphics device and of the transport session. A requested view that cannot be rendered, or panics, is no error.
     pub fn publish(
         &self,
         session: &mut Session,
@@ -92,9 +95,9 @@ impl LiveViews {
             }
         }
         for viewpoint in publisher.publisher().due_viewpoints(Instant::now()) {
-            match session.render(&viewpoint.camera) {
+            match session.render_or_catch(|session| (self.draw)(session, &viewpoint.camera)) {
                 Ok(view) => {
-                    publisher.publish(&viewpoint.view, view, set);
+                    publisher.publish_viewpoint(&viewpoint, view, set);
                     count += 1;
                 }
                 Err(error) => {
@@ -108,5 +111,93 @@ impl LiveViews {
             }
         }
         Ok(count)
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use flyrig_body::{ShapeParams, default_template};
+    use flyrig_gpu::{AdapterChoice, GpuContext};
+    use flyrig_transport::{Interests, Publisher, Subscriber, TransportConfig, ViewpointStatus};
+    use flyrig_types::{Frame, Image, Intrinsics, Isometry, PersonId, PixelFormat, PoseTrack, Rig};
+    use glam::DVec3;
+
+    use super::*;
+    use crate::{
+        perception::given::{GivenPerception, GivenPerson},
+        session::SessionBuilder,
+        settings::{body::BodySettings, session::SessionSettings},
+    };
+
+    fn camera(name: &str, side: u32) -> Camera {
+        let pose = Isometry::look_at(DVec3::new(0.0, 1.0, 3.4), DVec3::new(0.0, 0.85, 0.0), DVec3::Y);
+        Camera::new(name, Intrinsics::pinhole(side, side, f64::from(side)), pose)
+    }
+
+    /// Returns a session whose one person is posed, and its frame set.
+    fn session() -> (Session, FrameSet) {
+        let rig = Rig { cameras: vec![camera("a", 32)], world_up: DVec3::Y };
+        let template = default_template(&ShapeParams::default()).unwrap();
+        let track = PoseTrack::new(vec![(0, template.skeleton.rest_pose())]).unwrap();
+        let person = GivenPerson { person: PersonId(0), template, track, repeat: false };
+        let perception = GivenPerception::new(&rig, vec![person]);
+        let settings = SessionSettings { body: BodySettings::with_gaussians(600), ..SessionSettings::default() };
+        let frame = Frame {
+            camera: "a".into(),
+            sequence: 0,
+            capture_nanos: 0,
+            exposure_nanos: None,
+            image: Image::new(32, 32, PixelFormat::Rgb8, vec![90; 32 * 32 * 3]).unwrap(),
+            mask: Some(flyrig_types::Mask::new(32, 32, vec![0; 32 * 32]).unwrap()),
+        };
+        let set = FrameSet { index: 0, master_nanos: 0, frames: vec![Some(std::sync::Arc::new(frame))] };
+        let gpu = GpuContext::new(&AdapterChoice::Best).unwrap();
+        let mut session = SessionBuilder::new(gpu, rig).settings(settings).perception(perception).build().unwrap();
+        session.process(&set).unwrap();
+        assert!(session.has_people());
+        (session, set)
+    }
+
+    fn wait_until(what: &str, mut is_true: impl FnMut() -> bool) {
+        let deadline = Instant::now() + Duration::from_secs(40);
+        while !is_true() {
+            assert!(Instant::now() < deadline, "waited in vain for {what}");
+            std::thread::sleep(Duration::from_millis(10));
+        }
+    }
+
+    #[test]
+    fn a_panic_while_a_viewers_view_is_drawn_ends_that_viewpoint_alone() {
+        let (mut session, set) = session();
+        let config = TransportConfig { listen: vec!["tcp/127.0.0.1:0".to_owned()], ..TransportConfig::publisher("v") };
+        let publisher = LivePublisher::start(Publisher::open(&config).unwrap(), 85).unwrap();
+        let connect = publisher.publisher().endpoints().to_vec();
+        let [bad, good] = [16, 64].map(|side| {
+            let config = TransportConfig { connect: connect.clone(), ..TransportConfig::subscriber("v") };
+            let subscriber = Subscriber::open(&config, &Interests::default()).unwrap();
+            subscriber.request_viewpoint(&camera("mine", side), 30.0).unwrap();
+            wait_until("a watched viewpoint", || {
+                publisher.publisher().has_subscribers(&subscriber.viewpoint_view())
+                    && matches!(subscriber.viewpoint_status(), ViewpointStatus::Granted { .. })
+            });
+            subscriber
+        });
+        let before = session.render(&camera("mine", 64)).unwrap();
+        let mut views = LiveViews::new(&OutputSettings { views: 0, ..OutputSettings::default() });
+        views.draw = |session, camera| {
+            let drawn = session.render(camera);
+            assert!(camera.size() != [16, 16], "injected");
+            drawn
+        };
+        let mut drawn = 0;
+        wait_until("the refusal", || {
+            drawn += views.publish(&mut session, &publisher, &set, Duration::ZERO).unwrap();
+            matches!(bad.viewpoint_status(), ViewpointStatus::Refused { reason } if reason.contains("panicked: injected"))
+        });
+        assert!(drawn > 0 && matches!(good.viewpoint_status(), ViewpointStatus::Granted { .. }));
+        assert_eq!(session.render(&camera("mine", 64)).unwrap().rgba, before.rgba);
+        assert_eq!(publisher.publisher().viewpoint_counts().active, 1);
+        assert!(publisher.threads().iter().all(|thread| thread.restarts == 0));
+        publisher.finish().unwrap();
     }
 }

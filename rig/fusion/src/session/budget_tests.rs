@@ -40,7 +40,7 @@ impl Machine {
             let noise = 0.75 + 0.5 * f64::from(self.random >> 16) / 65_536.0;
             let share: f64 = self.steps[..=self.budget.level()].iter().product();
             let secs = full(i) * share * noise;
-            self.budget.spend(Duration::from_secs_f64(secs));
+            self.budget.spend(flyrig_types::saturating_secs(secs));
             course.levels.push(self.budget.level());
             course.secs += secs;
         }

@@ -23,7 +23,7 @@ use std::{collections::BTreeMap, sync::Arc, time::Instant};
 
 use flyrig_gpu::GpuContext;
 use flyrig_renderer::{GaussianBuffers, RenderTarget, Splat};
-use flyrig_types::{Camera, Frame, FrameSet, Image, PersonId, Pose, RenderedView, Rig};
+use flyrig_types::{Camera, Frame, FrameSet, Image, PersonId, Pose, RenderedView, Rig, caught};
 
 use crate::{
     error::FusionError,
@@ -101,6 +101,12 @@ impl Session {
     #[must_use]
     pub fn has_people(&self) -> bool {
         self.subjects.iter().any(|subject| subject.pose().is_some())
+    }
+
+    /// Returns how the first person contradicts the rig's up direction ([`crate::Upright::fault`]); `None` where they agree.
+    #[must_use]
+    pub fn upright_fault(&self) -> Option<String> {
+        self.subjects.first().and_then(|subject| subject.upright().fault(self.rig.world_up))
     }
 
     /// Replaces perception from the next frame set on.
@@ -287,6 +293,7 @@ impl Session {
         };
         let pose = &seen.pose;
         subject.track.curve.push(set.master_nanos, pose);
+        subject.check_up(pose, self.rig.world_up);
         let per_view_time = self.settings.tracking.per_view_time;
         let poses = view_poses(set, seen, per_view_time, |nanos| subject.track.curve.at(nanos));
         let (slots, views) = input_views(set, seen, &poses, &self.rig, &mut self.counts);
@@ -345,6 +352,20 @@ impl Session {
         let view = self.view_renderer.render(&self.gpu, &people, camera, &mut self.stages);
         self.stages.count_traffic(self.gpu.traffic().since(before));
         view
+    }
+
+    /// Renders all people as [`Self::render`] does. After a panic the parts that draw are built anew, so that the session is as it was.
+    ///
+    /// # Errors
+    /// Those of [`Self::render`], and [`FusionError::View`] after a panic.
+    pub(crate) fn render_or_catch(
+        &mut self,
+        render: impl FnOnce(&mut Self) -> Result<RenderedView, FusionError>,
+    ) -> Result<RenderedView, FusionError> {
+        caught(|| render(self)).unwrap_or_else(|panic| {
+            self.view_renderer = ViewRenderer::new(&self.gpu, self.settings.body.gaussians)?;
+            Err(FusionError::View(panic))
+        })
     }
 
     /// Returns the size of the largest view that the adapter can hold, pixels.

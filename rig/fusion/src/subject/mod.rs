@@ -17,6 +17,7 @@ mod stage_clock;
 pub(crate) mod stream_frame;
 mod surface;
 pub(crate) mod track_watch;
+pub(crate) mod upright;
 
 pub use geometry::PROCESSOR_STAGE;
 pub use memory::PersonMemory;
@@ -24,3 +25,4 @@ pub use person::{Observed, Subject};
 pub use stream_frame::{PersonFrame, stream_joints};
 pub use surface::{person_gaussians, person_surface};
 pub use track_watch::{Remedy, TrackState, TrackWatch};
+pub use upright::Upright;

@@ -34,12 +34,16 @@ use super::{
     stream_frame::{PersonFrame, encode_template, motion},
     surface::person_surface,
     track_watch::TrackWatch,
+    upright::Upright,
 };
 use crate::{
     error::FusionError,
     health::stage_times::StageTimes,
     settings::{effort::Effort, session::SessionSettings},
 };
+
+/// Number of updates after which the up direction is checked against the person.
+const UPRIGHT_SETS: u32 = 10;
 
 /// Inputs and results of a person's last update, read back: the raw material of training samples.
 #[derive(Debug)]
@@ -73,6 +77,7 @@ pub(crate) struct PersonTrack {
     /// Last poses, for the times between and shortly after them.
     pub curve: PoseCurve,
     pub watch: TrackWatch,
+    pub upright: Upright,
     pub last_pose: Option<Pose>,
     /// Confidence in the last pose, 0..=1.
     pub confidence: f64,
@@ -200,6 +205,27 @@ impl Subject {
     #[must_use]
     pub fn watch(&self) -> &TrackWatch {
         &self.track.watch
+    }
+
+    /// Notes how the person stands, and warns once where that contradicts the world's up direction.
+    pub(crate) fn check_up(&mut self, pose: &Pose, world_up: DVec3) {
+        if self.track.upright.count() >= UPRIGHT_SETS {
+            return;
+        }
+        if let Some(direction) = self.template().skeleton.standing(pose) {
+            self.track.upright.add(direction);
+        }
+        if self.track.upright.count() == UPRIGHT_SETS
+            && let Some(fault) = self.track.upright.fault(world_up)
+        {
+            tracing::warn!(person = %self.id, "{fault}");
+        }
+    }
+
+    /// Returns the person's mean direction from the feet to the head.
+    #[must_use]
+    pub fn upright(&self) -> &Upright {
+        &self.track.upright
     }
 
     /// Returns the pose of the last update.

@@ -3,7 +3,7 @@
 
 use std::{cell::RefCell, fs, path::Path, time::Duration};
 
-use flyrig_body::{load_gltf, parse_bvh};
+use flyrig_body::{BodyError, Joint, MotionClip, RetargetOptions, Skeleton, load_gltf, load_gltf_motion, parse_bvh};
 use flyrig_calib::load_easymocap;
 use flyrig_capture::{
     CameraSource as _, FolderOptions, FolderReplay, McapReplay, RecordedCamera, foreign_cameras, recorded_notes,
@@ -16,6 +16,7 @@ use flyrig_transport::{
     decode_calibration, decode_transforms,
 };
 use flyrig_types::{Image, PixelFormat};
+use glam::{DMat4, DQuat, DVec3};
 
 /// Decoder under test.
 pub struct Target {
@@ -278,11 +279,36 @@ fn stream(input: &[u8]) -> Result<String, String> {
     taken.map(|()| format!("{kind:?} {}", if shown > 0 { "shown" } else { "hidden" }))
 }
 
-/// Parses BVH text or a binary glTF file.
+/// Parses BVH text or a binary glTF file and transfers its motion to a skeleton of the legs.
 fn motion(input: &[u8]) -> Result<String, String> {
+    let retarget = |clip: MotionClip| clip.retarget(&legs()?, &RetargetOptions::default());
     if input.starts_with(b"glTF") {
-        return with_files(&[("body.glb", input)], |root| outcome_of(load_gltf(&root.join("body.glb")), "a body"))?;
+        return with_files(&[("body.glb", input)], |root| {
+            let path = root.join("body.glb");
+            outcome_of(load_gltf(&path).and_then(|_| load_gltf_motion(&path)).and_then(retarget), "a body")
+        })?;
     }
     let text = String::from_utf8_lossy(input);
-    outcome_of(parse_bvh(&text, Path::new("x.bvh")), "a clip")
+    outcome_of(parse_bvh(&text, Path::new("x.bvh")).and_then(|clip| retarget(clip.motion())), "a clip")
+}
+
+/// Returns a skeleton of hips, a head and two legs.
+fn legs() -> Result<Skeleton, BodyError> {
+    let joint = |name: &str, parent: Option<usize>, at: [f64; 3], origin: [f64; 3]| Joint {
+        name: name.to_owned(),
+        parent,
+        rest_translation: DVec3::from(at),
+        rest_rotation: DQuat::IDENTITY,
+        joint_from_canonical: DMat4::from_translation(-DVec3::from(origin)),
+    };
+    let mut joints = vec![joint("Hips", None, [0.0, 0.9, 0.0], [0.0, 0.9, 0.0])];
+    joints.push(joint("Head", Some(0), [0.0, 0.7, 0.0], [0.0, 1.6, 0.0]));
+    for (side, x) in [("Left", 0.1), ("Right", -0.1)] {
+        let hip = joints.len();
+        joints.push(joint(&format!("{side}UpLeg"), Some(0), [x, 0.0, 0.0], [x, 0.9, 0.0]));
+        joints.push(joint(&format!("{side}Leg"), Some(hip), [0.0, -0.4, 0.0], [x, 0.5, 0.0]));
+        joints.push(joint(&format!("{side}Foot"), Some(hip + 1), [0.0, -0.4, 0.0], [x, 0.1, 0.0]));
+        joints.push(joint(&format!("{side}ToeBase"), Some(hip + 2), [0.0, -0.1, 0.1], [x, 0.0, 0.1]));
+    }
+    Skeleton::new(joints)
 }

@@ -27,6 +27,7 @@ impl PoseEstimator {
         let scene = SearchScene {
             net: &self.net,
             cameras: &self.rig.cameras,
+            up: self.rig.world_up,
             pictures,
             backgrounds: &self.backgrounds,
             nanos: set.master_nanos,

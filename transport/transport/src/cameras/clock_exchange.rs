@@ -15,7 +15,10 @@ use zenoh::{
     query::{ConsolidationMode, Query},
 };
 
-use crate::{cameras::host_clock::HostClock, error::TransportError};
+use crate::{
+    cameras::{host_clock::HostClock, host_id::HostId},
+    error::TransportError,
+};
 
 /// Interval between two queries of a clock: at first, and later.
 const EAGER: Duration = Duration::from_millis(50);
@@ -42,7 +45,7 @@ pub(crate) struct ClockQuery {
     /// Key of the query.
     pub key: String,
     /// Identity of the computer.
-    pub host: u64,
+    pub host: HostId,
     /// Whether more answers are needed soon.
     pub is_urgent: bool,
 }
@@ -60,7 +63,7 @@ impl Asker {
         session: Session,
         clock: HostClock,
         hosts: impl Fn() -> Vec<ClockQuery> + Send + 'static,
-        take: impl Fn(u64, i64, i64, i64) + Send + Sync + 'static,
+        take: impl Fn(&HostId, i64, i64, i64) + Send + Sync + 'static,
     ) -> Result<Self, TransportError> {
         let stop = Arc::new(AtomicBool::new(false));
         let (stopped, take) = (stop.clone(), Arc::new(take));
@@ -98,9 +101,9 @@ impl Asker {
 
 fn ask<T>(session: &Session, clock: &HostClock, query: &ClockQuery, take: Arc<T>)
 where
-    T: Fn(u64, i64, i64, i64) + Send + Sync + 'static,
+    T: Fn(&HostId, i64, i64, i64) + Send + Sync + 'static,
 {
-    let (host, clock) = (query.host, clock.clone());
+    let (host, clock) = (query.host.clone(), clock.clone());
     let of_answer = clock.clone();
     let asked = clock.now_nanos();
     let sent = session
@@ -116,7 +119,7 @@ where
             let Ok(sample) = reply.result() else { return };
             // An answer of another length is ignored.
             if let Ok(time) = <[u8; 8]>::try_from(&*sample.payload().to_bytes()) {
-                take(host, asked, i64::from_le_bytes(time), answered);
+                take(&host, asked, i64::from_le_bytes(time), answered);
             }
         })
         .wait();

@@ -176,6 +176,7 @@ mod tests {
             capture_nanos: -5,
             width: 4,
             height: 2,
+            publish_nanos: 0,
             ..empty_header()
         };
         FrameHeader { header, exposure_nanos: Some(8_000_000), withheld: 3, format }

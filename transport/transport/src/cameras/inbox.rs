@@ -12,11 +12,12 @@ use crate::{
         clock_exchange::ClockQuery,
         frame::{CameraStatus, FrameHeader},
         host_clock::ClockFit,
+        host_id::HostId,
         link::CameraLink,
     },
     error::TransportError,
     header::{Header, MessageKind},
-    host, keys,
+    keys,
     printable::printable,
     schema::SCHEMA_VERSION,
 };
@@ -32,6 +33,8 @@ const OLDEST: i64 = 10_000_000_000;
 const EARLIEST: i64 = 500_000_000;
 /// Largest number of computers and names that are remembered.
 const MAX_HOSTS: usize = 256;
+/// Largest number of computers of one key: as many as it may have connections.
+const MAX_HOSTS_OF_KEY: usize = 16;
 /// Largest number of names of others in an error.
 const SHOWN_NAMES: usize = 8;
 /// Number of quick queries to a computer that does not answer.
@@ -44,8 +47,8 @@ pub(crate) struct CameraInbox {
     slots: Vec<Slot>,
     /// Bound of the bytes of waiting images over all cameras.
     quota: u64,
-    /// Computers with cameras, by publisher.
-    hosts: BTreeMap<u64, Host>,
+    /// Computers with cameras.
+    hosts: BTreeMap<HostId, Host>,
     /// Keys of computers of other rigs and versions.
     others: BTreeSet<String>,
 }
@@ -69,7 +72,7 @@ struct Slot {
     camera: CameraId,
     waiting: VecDeque<Frame>,
     link: CameraLink,
-    publisher: Option<u64>,
+    publisher: Option<HostId>,
     arrived: Option<Instant>,
     /// Sequence number and withheld count of the previous message.
     last: Option<(u64, u64)>,
@@ -112,7 +115,7 @@ impl CameraInbox {
             return;
         }
         let Some(name) = keys::name_in(key, "host", "") else { return };
-        let id = host::fnv1a(name.as_bytes());
+        let id = HostId::named(name);
         if !is_alive {
             self.hosts.remove(&id);
             return;
@@ -121,7 +124,8 @@ impl CameraInbox {
             // Names without a computer behind them must not keep a real computer out.
             self.hosts.retain(|_, host| !host.is_mute());
         }
-        if self.hosts.len() < MAX_HOSTS {
+        let of_key = |other: &&HostId| id.holder().is_some() && other.holder() == id.holder();
+        if self.hosts.len() < MAX_HOSTS && self.hosts.keys().filter(of_key).count() < MAX_HOSTS_OF_KEY {
             let clock_key = keys::key(&self.rig, &format!("clock/{name}"));
             self.hosts.entry(id).or_insert_with(|| Host { clock_key, fit: ClockFit::default(), asked: 0 });
         }
@@ -129,11 +133,11 @@ impl CameraInbox {
 
     /// Returns the queries for clocks to send now.
     pub fn clock_queries(&mut self) -> Vec<ClockQuery> {
-        let query = |(host, state): (&u64, &mut Host)| {
+        let query = |(host, state): (&HostId, &mut Host)| {
             state.asked = state.asked.saturating_add(1);
             ClockQuery {
                 key: state.clock_key.clone(),
-                host: *host,
+                host: host.clone(),
                 is_urgent: state.fit.is_young() && !state.is_mute(),
             }
         };
@@ -141,8 +145,8 @@ impl CameraInbox {
     }
 
     /// Ingests an answer to a query for a clock.
-    pub fn clock(&mut self, host: u64, asked: i64, answer: i64, answered: i64) {
-        if let Some(host) = self.hosts.get_mut(&host) {
+    pub fn clock(&mut self, host: &HostId, asked: i64, answer: i64, answered: i64) {
+        if let Some(host) = self.hosts.get_mut(host) {
             host.fit.add(asked, answer, answered);
         }
     }
@@ -169,10 +173,11 @@ impl CameraInbox {
         }
     }
 
-    /// Ingests a frame of a camera; `now_nanos` is the local time.
+    /// Ingests a frame of a camera; `holder` is the session of a key's holder that sent it, `now_nanos` the local time.
     pub fn frame(
         &mut self,
         camera: &CameraId,
+        holder: Option<HostId>,
         key: &str,
         attachment: &[u8],
         payload: Result<Vec<u8>, TransportError>,
@@ -183,14 +188,16 @@ impl CameraInbox {
             Ok(header) => header,
             Err(error) => return slot.refuse(error),
         };
-        if let Err(error) = slot.follow(&header, &self.hosts) {
+        // A holder does not choose whose clock its frames are timed by.
+        let publisher = holder.unwrap_or(HostId::Program(header.header.publisher));
+        if let Err(error) = slot.follow(&header, &publisher, &self.hosts) {
             return slot.refuse(error);
         }
         let frame = match payload.and_then(|bytes| header.frame(key, camera, bytes)) {
             Ok(frame) => frame,
             Err(error) => return slot.refuse(error),
         };
-        let host = self.hosts.get(&header.header.publisher);
+        let host = self.hosts.get(&publisher);
         let Some(capture_nanos) = host.and_then(|host| host.fit.to_local(frame.capture_nanos)) else {
             slot.link.before_clock += 1;
             return;
@@ -233,7 +240,7 @@ impl CameraInbox {
     /// Returns the state of the link to a camera at a local time.
     pub fn link(&self, camera: &CameraId, now_nanos: i64) -> CameraLink {
         let Some(slot) = self.slots.iter().find(|slot| slot.camera == *camera) else { return CameraLink::default() };
-        let host = slot.publisher.and_then(|publisher| self.hosts.get(&publisher));
+        let host = slot.publisher.as_ref().and_then(|publisher| self.hosts.get(publisher));
         CameraLink { clock: host.and_then(|host| host.fit.estimate(now_nanos)), ..slot.link.clone() }
     }
 
@@ -250,7 +257,7 @@ impl CameraInbox {
         let status = slot.link.status.as_ref();
         let host = status.map(|status| status.host.as_str()).filter(|host| !host.is_empty());
         let computer = host.map_or_else(|| "its computer".to_owned(), |host| format!("its computer '{host}'"));
-        let is_there = slot.publisher.map(|publisher| self.hosts.contains_key(&publisher));
+        let is_there = slot.publisher.as_ref().map(|publisher| self.hosts.contains_key(publisher));
         if is_there == Some(false) {
             return format!("{computer} has left the network; start `flyrig capture` there again, or check the cable");
         }
@@ -299,11 +306,16 @@ impl Slot {
     }
 
     /// Counts the messages missing before this one. A camera has one publisher at a time.
-    fn follow(&mut self, header: &FrameHeader, hosts: &BTreeMap<u64, Host>) -> Result<(), TransportError> {
-        let FrameHeader { header: Header { publisher, sequence, .. }, withheld, .. } = *header;
-        if let Some(before) = self.publisher.filter(|before| *before != publisher) {
+    fn follow(
+        &mut self,
+        header: &FrameHeader,
+        publisher: &HostId,
+        hosts: &BTreeMap<HostId, Host>,
+    ) -> Result<(), TransportError> {
+        let FrameHeader { header: Header { sequence, .. }, withheld, .. } = *header;
+        if let Some(before) = self.publisher.as_ref().filter(|before| *before != publisher) {
             let is_fresh = self.arrived.is_some_and(|at| at.elapsed() < SUCCESSION);
-            if is_fresh && hosts.contains_key(&before) {
+            if is_fresh && hosts.contains_key(before) {
                 return Err(TransportError::malformed(
                     format!("camera {}", self.camera),
                     "two computers publish a camera of this name; give each its own in source.cameras",
@@ -318,7 +330,7 @@ impl Slot {
             self.link.withheld = self.link.withheld.saturating_add(not_sent);
             self.link.lost = self.link.lost.saturating_add(gap - not_sent);
         }
-        self.publisher = Some(publisher);
+        self.publisher = Some(publisher.clone());
         self.arrived = Some(Instant::now());
         self.last = Some((sequence, withheld));
         Ok(())

@@ -18,7 +18,7 @@ use crate::{
     header::{Header, MessageKind, empty_header},
     keys,
     session::{
-        config::{LARGEST_QUESTION, TransportConfig},
+        config::{LARGEST_QUESTION, Side, TransportConfig},
         opening::{self, Opened},
     },
     topic::{Body, PublishOutcome, Topic, TopicCounts},
@@ -55,25 +55,33 @@ impl CameraPublisher {
     /// Opens the session and starts its thread. `clock` stamps the frames.
     ///
     /// # Errors
-    /// `Config` for names that cannot be part of a key, or `Session` when zenoh cannot listen there.
+    /// `Config` for names that cannot be part of a key and for cameras that the holder's key is not for, or `Session` when zenoh cannot
+    /// listen there.
     pub fn open(config: &TransportConfig, cameras: &[CameraId], clock: HostClock) -> Result<Self, TransportError> {
         config.validate()?;
         let rig = &config.rig;
-        let lane = |camera: &CameraId| {
+        for camera in cameras {
             keys::check_name("camera", camera.as_str())?;
-            let topic = |label: String, kind| Arc::new(Topic::new(label.clone(), label, kind));
-            Ok(Lane {
+            check_right(config, camera)?;
+        }
+        let Opened { session, endpoints, .. } = opening::open(config, Side::Sender, LARGEST_QUESTION, &[])?;
+        let host = session.zid().to_string();
+        let host = config.key.as_ref().map_or(host.clone(), |key| keys::session_name(&key.topic_name, &host));
+        let lane = |camera: &CameraId| {
+            let topic = |label: String, kind| {
+                let label = if config.key.is_some() { keys::of_holder(&label, &host) } else { label };
+                Arc::new(Topic::new(label.clone(), label, kind))
+            };
+            Lane {
                 camera: camera.clone(),
                 frames: topic(keys::frames_label(camera), MessageKind::Frame),
                 status: topic(keys::status_label(camera), MessageKind::CameraStatus),
-            })
+            }
         };
-        let cameras: Vec<Lane> = cameras.iter().map(lane).collect::<Result<_, TransportError>>()?;
-        let Opened { session, endpoints, .. } = opening::open(config, LARGEST_QUESTION, &[])?;
+        let cameras: Vec<Lane> = cameras.iter().map(lane).collect();
         let failed = |error: zenoh::Error| TransportError::session(format!("cameras of rig {rig}"), &error);
         let topics: Vec<_> = cameras.iter().flat_map(|lane| [lane.frames.clone(), lane.status.clone()]).collect();
         let (shared, woken) = PublisherState::new(rig, &session, &topics, Leases::new(0, Duration::ZERO, 0));
-        let host = session.zid().to_string();
         clock_exchange::answer(&session, keys::key(rig, &format!("clock/{host}")), clock).map_err(failed)?;
         let alive = keys::key(rig, &format!("host/{host}"));
         let alive = session.liveliness().declare_token(alive).wait().map_err(failed)?;
@@ -159,5 +167,20 @@ impl CameraPublisher {
             self.shared.wake();
         }
         outcome
+    }
+}
+
+/// Checks that the key, where there is one, is for a camera: the rig would leave its images out.
+fn check_right(config: &TransportConfig, camera: &CameraId) -> Result<(), TransportError> {
+    match &config.key {
+        Some(key) if !key.may_send(camera.as_str()) => {
+            let text = format!(
+                "the key of '{}' is for {}; take it out of source.cameras, or ask for a key that names it (`flyrig keys add NAME --role cameras --camera {camera}`)",
+                key.holder,
+                key.cameras.join(", ")
+            );
+            Err(TransportError::config(format!("camera {camera}"), text))
+        }
+        _ => Ok(()),
     }
 }

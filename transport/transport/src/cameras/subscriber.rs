@@ -6,7 +6,7 @@ use std::{
     time::{Duration, Instant},
 };
 
-use flyrig_access::{Gate, Role};
+use flyrig_access::{Gate, HolderList, Role};
 use flyrig_types::{CameraId, Frame, ThreadWatch, wait_timeout};
 use zenoh::{Session, Wait, sample::Sample, sample::SampleKind};
 
@@ -15,6 +15,7 @@ use crate::{
         clock_exchange::{Asker, ClockQuery},
         frame::MAX_FRAME_BYTES,
         host_clock::HostClock,
+        host_id::HostId,
         inbox::CameraInbox,
         link::CameraLink,
     },
@@ -23,7 +24,7 @@ use crate::{
     json::MAX_JSON_BYTES,
     keys,
     session::{
-        config::{LARGEST_QUESTION, TransportConfig},
+        config::{LARGEST_QUESTION, Side, TransportConfig},
         opening::{self, Opened},
     },
     topic::lock,
@@ -49,6 +50,8 @@ struct Shared {
     changed: Condvar,
     clock: HostClock,
     inbox_bytes: u64,
+    /// Holders of keys, who send under names of their own.
+    holders: Option<HolderList>,
 }
 
 impl std::fmt::Debug for CameraSubscriber {
@@ -68,7 +71,8 @@ impl CameraSubscriber {
         for camera in cameras {
             keys::check_name("camera", camera.as_str())?;
         }
-        let Opened { session, gate, .. } = opening::open(config, MAX_FRAME_BYTES + LARGEST_QUESTION, &[Role::Cameras])?;
+        let Opened { session, gate, .. } =
+            opening::open(config, Side::Receiver, MAX_FRAME_BYTES + LARGEST_QUESTION, &[Role::Cameras])?;
         let failed = |error: zenoh::Error| TransportError::session(format!("cameras of rig {rig}"), &error);
         let shared = Arc::new(Shared {
             rig: rig.clone(),
@@ -76,9 +80,12 @@ impl CameraSubscriber {
             changed: Condvar::new(),
             clock: clock.clone(),
             inbox_bytes: config.inbox_bytes,
+            holders: gate.as_ref().map(Gate::holders),
         });
         for camera in cameras {
-            for label in [keys::frames_label(camera), keys::status_label(camera)] {
+            let own = [keys::frames_label(camera), keys::status_label(camera)];
+            let of_holders = own.iter().filter(|_| gate.is_some()).map(|label| keys::of_holder(label, "*"));
+            for label in own.iter().cloned().chain(of_holders) {
                 let (shared, camera) = (shared.clone(), camera.clone());
                 session
                     .declare_subscriber(keys::key(rig, &label))
@@ -103,7 +110,7 @@ impl CameraSubscriber {
             .map_err(failed)?;
         let (asking, taking) = (shared.clone(), shared.clone());
         let hosts = move || -> Vec<ClockQuery> { lock(&asking.inbox).clock_queries() };
-        let take = move |host, asked, answer, answered| {
+        let take = move |host: &HostId, asked, answer, answered| {
             lock(&taking.inbox).clock(host, asked, answer, answered);
         };
         let asker = Asker::start(session.clone(), clock, hosts, take)?;
@@ -138,7 +145,7 @@ impl CameraSubscriber {
     /// `UnknownVersion` or `Malformed` for a message that could not be used, the same text once in ten seconds; the subscriber stays usable.
     /// `Config` for a camera that was not named at the start.
     pub fn next_frame(&self, camera: &CameraId, timeout: Duration) -> Result<Option<Frame>, TransportError> {
-        let deadline = Instant::now() + timeout;
+        let deadline = flyrig_types::deadline_after(timeout);
         let mut inbox = lock(&self.shared.inbox);
         loop {
             if let Some(result) = inbox.take(camera)? {
@@ -193,7 +200,17 @@ impl Shared {
     /// Ingests a sample; runs on a zenoh thread.
     fn receive(&self, camera: &CameraId, sample: &Sample) {
         let key = sample.key_expr().as_str();
-        let is_status = keys::label_in(key).is_some_and(|label| label.starts_with(keys::STATUS));
+        let label = keys::label_in(key).unwrap_or_default();
+        let is_status = label.starts_with(keys::STATUS);
+        let own = if is_status { keys::status_label(camera) } else { keys::frames_label(camera) };
+        let holder = label.strip_prefix(&own).and_then(|rest| rest.strip_prefix('/')).map(HostId::named);
+        if let Some(holders) = self.holders.as_ref().filter(|_| label != own) {
+            // Not even an error of the camera: its true computer may send it at the same time.
+            let name = holder.as_ref().and_then(HostId::holder).unwrap_or_default();
+            if !holders.may_send(name, camera.as_str()) {
+                return;
+            }
+        }
         let attachment = sample.attachment().filter(|bytes| bytes.len() <= MAX_ATTACHMENT);
         let attachment = attachment.map(zenoh::bytes::ZBytes::to_bytes).unwrap_or_default();
         // A payload that is too long is not even copied.
@@ -212,7 +229,7 @@ impl Shared {
         if is_status {
             inbox.status(camera, key, &attachment, payload);
         } else {
-            inbox.frame(camera, key, &attachment, payload, now_nanos);
+            inbox.frame(camera, holder, key, &attachment, payload, now_nanos);
         }
         drop(inbox);
         self.changed.notify_all();

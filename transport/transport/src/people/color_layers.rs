@@ -1,8 +1,8 @@
 //! Choice of the colour layers that a line carries: fewer while motion is late or missing, more again once it is on time.
 //!
 //! The receiver alone decides, from the arrival of motion: colours that are not subscribed to are not sent, so the slow line of one viewer
-//! costs the others nothing, and a relay adapts to its own line. On an overloaded computer threads ingest messages late whatever the line
-//! does: a thread that only waits measures by how much (`wake_lag.rs`).
+//! costs the others nothing, and a relay adapts to its own line. Wall clocks play no part, since a step of one looks like a queue. On an
+//! overloaded computer threads ingest messages late whatever the line does: a thread that only waits measures by how much (`wake_lag.rs`).
 
 use std::{
     collections::VecDeque,
@@ -63,6 +63,8 @@ pub(crate) struct ColorLayers {
     /// Number of layers to return to when queues are empty again.
     carried: usize,
     is_begun: bool,
+    /// Identity of the clock that stamps motion.
+    clock: Option<u64>,
     /// Start and least latency of each second.
     fastest: VecDeque<(Instant, i64)>,
     latencies: Vec<i64>,
@@ -95,6 +97,7 @@ impl ColorLayers {
             wanted: 0,
             carried: 0,
             is_begun: false,
+            clock: None,
             fastest: VecDeque::new(),
             latencies: Vec::new(),
             lags: Vec::new(),
@@ -174,8 +177,14 @@ impl ColorLayers {
         }
     }
 
-    /// Ingests the arrival of a motion: its latency by any two clocks, and the number of motions missed before it.
-    pub fn motion(&mut self, now: Instant, latency_nanos: i64, missed: u64) {
+    /// Ingests the arrival of a motion: its latency by any two clocks that are never set, the identity of the sender's clock, and the number
+    /// of motions missed before it.
+    pub fn motion(&mut self, now: Instant, clock: u64, latency_nanos: i64, missed: u64) {
+        if self.clock.replace(clock) != Some(clock) {
+            // Another computer, or the same after a boot: its times compare with no earlier ones.
+            self.fastest.clear();
+            self.latencies.clear();
+        }
         self.note_way(now, latency_nanos);
         let is_pause = self.last.replace(now).is_some_and(|last| now.duration_since(last) > PAUSE);
         let missed = if is_pause { 0 } else { missed };
@@ -333,7 +342,8 @@ mod tests {
                 self.random =
                     self.random.wrapping_mul(6_364_136_223_846_793_005).wrapping_add(1_442_695_040_888_963_407);
                 let share = (self.random >> 33) as f64 / f64::from(1u32 << 31);
-                self.turns[thread] += self.pauses[thread].mul_f64(0.1 + 0.9 * share);
+                let pause = self.pauses[thread].as_secs_f64() * (0.1 + 0.9 * share);
+                self.turns[thread] += flyrig_types::saturating_secs(pause);
             }
             self.turns[thread]
         }
@@ -357,7 +367,7 @@ mod tests {
                 self.ticks.run(woken, |by| self.layers.woke_late(by));
                 let waited = taken.duration_since(self.now).as_nanos() as i64;
                 // A clock that is an hour ahead.
-                self.layers.motion(taken, 3_600_000_000_000 + 50_000_000 + self.queue_nanos + waited, 0);
+                self.layers.motion(taken, 1, 3_600_000_000_000 + 50_000_000 + self.queue_nanos + waited, 0);
                 counts[self.layers.wanted()] += 1;
             }
             let share = |count: usize| count as f64 / (30 * secs) as f64;
@@ -429,7 +439,7 @@ mod tests {
             let mut layers = begun(start);
             for i in 0..600u32 {
                 (0..3).for_each(|_| layers.woke_late(Duration::from_millis(lag_millis)));
-                layers.motion(start + i * Duration::from_millis(66), 10_000_000, 1);
+                layers.motion(start + i * Duration::from_millis(66), 1, 10_000_000, 1);
             }
             assert!(layers.wanted().abs_diff(expected) <= 1, "{lag_millis}: {}", layers.wanted());
         }
@@ -441,7 +451,7 @@ mod tests {
         let mut layers = begun(now);
         (0..100_000).for_each(|_| layers.woke_late(Duration::MAX));
         assert!(layers.lags.len() <= MOST_LAGS);
-        (0..1000).for_each(|i| layers.motion(now + i * Duration::from_millis(33), i64::MIN, u64::MAX));
+        (0..1000).for_each(|i| layers.motion(now + i * Duration::from_millis(33), 1, i64::MIN, u64::MAX));
         assert!(layers.lags.is_empty());
     }
 
@@ -464,7 +474,7 @@ mod tests {
             let mut layers = begun(start);
             for i in 0..300u32 {
                 let missed = u64::from(i % 4 < missed_of_four);
-                layers.motion(start + i * Duration::from_millis(66), 10_000_000, missed);
+                layers.motion(start + i * Duration::from_millis(66), 1, 10_000_000, missed);
             }
             assert!(layers.wanted().abs_diff(expected) <= 1, "{missed_of_four}: {}", layers.wanted());
         }
@@ -486,7 +496,7 @@ mod tests {
     /// Fetches a template of 1.2 MB at a rate, bytes per second.
     fn fetch(line: &mut Line, bytes_per_sec: f64) {
         line.layers.fetch_begins(line.now);
-        line.now += Duration::from_secs_f64(1.2e6 / bytes_per_sec);
+        line.now += flyrig_types::saturating_secs(1.2e6 / bytes_per_sec);
         line.layers.fetch_ends(line.now, 1_200_000);
         line.run(1);
     }
@@ -523,7 +533,7 @@ mod tests {
             let mut line = Line::new(LAYERS);
             line.layers.fetch_begins(line.now);
             line.layers.fetch_begins(line.now);
-            line.now += Duration::from_secs_f64(bytes as f64 / rate);
+            line.now += flyrig_types::saturating_secs(bytes as f64 / rate);
             line.layers.fetch_ends(line.now, 0);
             line.layers.fetch_ends(line.now, bytes);
             line.run(5);
@@ -537,7 +547,7 @@ mod tests {
         for _ in 0..5 {
             line.run(10);
             line.now += Duration::from_secs(3);
-            line.layers.motion(line.now, 3_600_050_000_000, 90);
+            line.layers.motion(line.now, 1, 3_600_050_000_000, 90);
         }
         line.run(1);
         assert_eq!(line.layers.wanted(), LAYERS);
@@ -547,7 +557,7 @@ mod tests {
     fn nothing_counts_before_colors_begin() {
         let now = Instant::now();
         let mut layers = ColorLayers::new(now);
-        (0..100).for_each(|i| layers.motion(now + i * Duration::from_millis(33), 0, 9));
+        (0..100).for_each(|i| layers.motion(now + i * Duration::from_millis(33), 1, 0, 9));
         assert_eq!(layers.wanted(), 0);
         layers.begin();
         layers.begin();
@@ -562,7 +572,7 @@ mod tests {
         for latency in [3_610_000_000_000, -5_000_000_000, i64::MIN, i64::MAX, 0] {
             for _ in 0..30 {
                 line.now += Duration::from_millis(33);
-                line.layers.motion(line.now, latency, if latency == 0 { u64::MAX } else { 0 });
+                line.layers.motion(line.now, 1, latency, if latency == 0 { u64::MAX } else { 0 });
             }
         }
         line.run(300);

@@ -254,7 +254,7 @@ impl PersonSubscription {
 
 /// Fetches a template in chunks, some of them under way at once, and checks its hash.
 fn ask_template(session: &Session, rig: &str, hash: u64, timeout: Duration) -> Result<Option<Vec<u8>>, TransportError> {
-    let deadline = Instant::now() + timeout;
+    let deadline = flyrig_types::deadline_after(timeout);
     let malformed = |problem: String| TransportError::malformed(keys::chunk_label(hash, 0), problem);
     let ask = |chunk: u32| ask_chunk(session, &keys::key(rig, &keys::chunk_label(hash, chunk)), deadline);
     let (mut bytes, mut count) = (Vec::new(), 1);

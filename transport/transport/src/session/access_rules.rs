@@ -84,41 +84,49 @@ pub(crate) fn behind_gate(ring: &Ring, roles: &[Role]) -> Value {
     let watching =
         ["watch-to", "watch-from", "templates-from", "templates-to", "viewpoints-to", "alive-to", "alive-from"];
 
-    let images: Vec<String> = ["camera/*", "camera-status/*"].map(key).to_vec();
-    let (clocks, hosts) = ([key("clock/*")], [keys::ANY_HOST.to_owned()]);
+    // Each holder sends images and clock answers under its own name alone; whether it may send the camera, the receiving side knows.
+    let images: Vec<String> = ["camera/*/*", "camera-status/*/*"].map(key).to_vec();
+    let hosts = [keys::ANY_HOST.to_owned()];
     rules.extend([
-        rule("cameras-from", FROM, &["put"], &images),
         rule("cameras-to", TO, &["declare_subscriber"], &images),
-        rule("clocks-from", FROM, &["declare_queryable", "reply"], &clocks),
-        rule("clocks-to", TO, &["query"], &clocks),
-        rule("hosts-from", FROM, &["liveliness_token"], &[key("host/*")]),
         rule("hosts-to", TO, &["liveliness_query", "declare_liveliness_subscriber"], &hosts),
     ]);
-    let sending = ["cameras-from", "cameras-to", "clocks-from", "clocks-to", "hosts-from", "hosts-to"];
+    let sending = ["cameras-to", "hosts-to"];
 
     for role in roles {
         for number in 0..MAX_HOLDERS {
             let name = Inner::name(*role, number);
-            let mut allowed: Vec<String> = Vec::new();
-            match role {
-                Role::Cameras => allowed.extend(sending.map(str::to_owned)),
+            let own = ring.names_of(number);
+            let (shared, own_rules): (&[&str], Vec<Value>) = match role {
+                Role::Cameras => {
+                    let images: Vec<String> =
+                        ["camera/*", "camera-status/*"].map(|label| key(&keys::of_holder(label, &own))).to_vec();
+                    let (clock, token) = ([key(&format!("clock/{own}"))], [key(&format!("host/{own}"))]);
+                    let own_rules = vec![
+                        rule(&format!("{name}-cameras-from"), FROM, &["put"], &images),
+                        rule(&format!("{name}-clock-from"), FROM, &["declare_queryable", "reply"], &clock),
+                        rule(&format!("{name}-clock-to"), TO, &["query"], &clock),
+                        rule(&format!("{name}-host-from"), FROM, &["liveliness_token"], &token),
+                    ];
+                    (sending.as_slice(), own_rules)
+                }
                 Role::Viewer | Role::Relay => {
-                    let own = ring.names_of(number);
                     let view = [key(&format!("viewer/{own}/view"))];
                     let viewpoint = [key(&format!("viewpoint/{own}"))];
                     let token = [key(&format!("viewer/{own}/alive"))];
-                    let own_rules = [
+                    let own_rules = vec![
                         rule(&format!("{name}-view-to"), TO, &["put"], &view),
                         rule(&format!("{name}-view-from"), FROM, &["declare_subscriber"], &view),
                         rule(&format!("{name}-viewpoint-from"), FROM, &["query"], &viewpoint),
                         rule(&format!("{name}-viewpoint-to"), TO, &["reply"], &viewpoint),
                         rule(&format!("{name}-alive-from"), FROM, &["liveliness_token"], &token),
                     ];
-                    allowed.extend(watching.map(str::to_owned));
-                    allowed.extend(own_rules.iter().filter_map(|rule| Some(rule.get("id")?.as_str()?.to_owned())));
-                    rules.extend(own_rules);
+                    (watching.as_slice(), own_rules)
                 }
-            }
+            };
+            let ids = own_rules.iter().filter_map(|rule| rule.get("id")?.as_str());
+            let allowed: Vec<String> = shared.iter().copied().chain(ids).map(str::to_owned).collect();
+            rules.extend(own_rules);
             subjects.push(json!({ "id": name, "cert_common_names": [name] }));
             policies.push(json!({ "rules": allowed, "subjects": [name] }));
         }

@@ -54,6 +54,15 @@ pub struct TransportConfig {
     pub inbox_bytes: u64,
 }
 
+/// Direction of a session's messages.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(crate) enum Side {
+    /// Rig, relay or computer with cameras.
+    Sender,
+    /// Viewer, or the rig towards cameras of other computers.
+    Receiver,
+}
+
 /// Largest request to a publisher (for a viewpoint or a clock), bytes.
 pub(crate) const LARGEST_QUESTION: usize = 1 << 20;
 
@@ -185,14 +194,21 @@ impl TransportConfig {
     /// before the message is assembled. `others` are further settings, which keys need.
     pub(crate) fn zenoh(
         &self,
+        side: Side,
         listen: &[String],
         connect: &[String],
         largest: usize,
         others: &[(&'static str, String)],
     ) -> Result<Config, TransportError> {
         let list = |endpoints: &[String]| serde_json::json!(endpoints).to_string();
+        // A zenoh router passes nothing from peer to peer, but all between its peers and other routers: a sender that connects to one is one.
+        // Rules of access are those of peers.
+        let is_router = side == Side::Sender && !connect.is_empty() && self.key.is_none() && !self.has_keys();
         let settings = [
-            ("mode", "\"peer\"".to_owned()),
+            ("mode", if is_router { "\"router\"" } else { "\"peer\"" }.to_owned()),
+            // What a router would do besides: stamp messages by the wall clock, and wait at its start.
+            ("timestamping/enabled", "false".to_owned()),
+            ("scouting/delay", "0".to_owned()),
             ("listen/endpoints", list(listen)),
             ("connect/endpoints", list(connect)),
             ("connect/timeout_ms", "-1".to_owned()),
@@ -222,9 +238,10 @@ impl TransportConfig {
 /// Prefix of the endpoints of rigs with keys.
 const TLS: &str = "tls/";
 
-/// Returns the endpoint of a rig with keys.
+/// Returns the endpoint of a rig with keys. zenoh takes the part before the last colon for the name in the rig's certificate, and knows
+/// no address in brackets.
 pub(crate) fn tls_endpoint(address: &str) -> String {
-    format!("{TLS}{address}")
+    format!("{TLS}{}", address.replace(['[', ']'], ""))
 }
 
 /// Returns whether only programs of this computer reach an endpoint.
@@ -242,7 +259,9 @@ mod tests {
     fn every_setting_is_known_to_zenoh() {
         for config in [TransportConfig::publisher("a"), TransportConfig::subscriber("a")] {
             config.validate().unwrap();
-            config.zenoh(&config.listen, &config.connect, LARGEST_QUESTION, &[]).unwrap();
+            for side in [Side::Sender, Side::Receiver] {
+                config.zenoh(side, &config.listen, &config.connect, LARGEST_QUESTION, &[]).unwrap();
+            }
         }
     }
 

@@ -11,7 +11,7 @@ use crate::{
     error::TransportError,
     session::{
         access_rules,
-        config::{TransportConfig, is_loopback, tls_endpoint},
+        config::{Side, TransportConfig, is_loopback, tls_endpoint},
         network_threads::check_network_threads,
     },
 };
@@ -44,7 +44,12 @@ impl From<AccessError> for TransportError {
 
 /// Opens a session of a rig, viewer or computer with cameras. Holders of keys of these roles may reach it where the settings name keys.
 /// `largest` bounds the messages to this session, bytes.
-pub(crate) fn open(config: &TransportConfig, largest: usize, roles: &[Role]) -> Result<Opened, TransportError> {
+pub(crate) fn open(
+    config: &TransportConfig,
+    side: Side,
+    largest: usize,
+    roles: &[Role],
+) -> Result<Opened, TransportError> {
     let ring = (config.has_keys() && !roles.is_empty()).then(|| Ring::open(&config.keys)).transpose()?;
     if let Some(ring) = ring.as_ref().filter(|ring| ring.rig() != config.rig) {
         let problem =
@@ -72,7 +77,7 @@ pub(crate) fn open(config: &TransportConfig, largest: usize, roles: &[Role]) -> 
         let mut listen = endpoints.clone();
         listen.extend(behind.iter().map(|(.., port)| tls_endpoint(&at_session(*port).to_string())));
         let settings = secured(behind.as_ref().map(|(ring, inner, _)| (*ring, inner)), roles, config.key.as_ref());
-        let session = match zenoh::open(config.zenoh(&listen, &connect, largest, &settings)?).wait() {
+        let session = match zenoh::open(config.zenoh(side, &listen, &connect, largest, &settings)?).wait() {
             Ok(session) => session,
             // Another program was faster to take the port.
             Err(_) if attempt < ATTEMPTS && listen != config.listen => continue,

@@ -2,16 +2,22 @@
 
 use std::{
     collections::VecDeque,
+    ops::RangeInclusive,
     time::{Duration, Instant},
 };
 
-use flyrig_types::Camera;
+use flyrig_types::{Camera, caught, saturating_secs};
 use serde::{Deserialize, Serialize};
 
-use crate::{error::TransportError, json::from_json, keys, printable::clean};
+use crate::{error::TransportError, json::from_json, keys, printable::clean, views::first_images::FirstImages};
 
 /// Largest side of an image that a subscriber may request, pixels.
 pub const MAX_VIEWPOINT_SIDE: u32 = 4096;
+
+/// Rates that a subscriber may request, images per second.
+const RATES: RangeInclusive<f64> = 0.01..=1000.0;
+/// Longest name of a requested camera that is kept, characters.
+const MAX_CAMERA_NAME: usize = 64;
 
 /// Time for which a request that could not be drawn is refused.
 const REFUSAL: Duration = Duration::from_secs(60);
@@ -85,8 +91,26 @@ pub(crate) fn check_camera(topic: &str, camera: &Camera, max_fps: f64) -> Result
     if width > MAX_VIEWPOINT_SIDE || height > MAX_VIEWPOINT_SIDE {
         return refuse(format!("{width}x{height} pixels requested, at most {MAX_VIEWPOINT_SIDE} per side"));
     }
-    if !(max_fps > 0.0 && max_fps <= 1000.0) {
-        return refuse(format!("{max_fps} images per second requested, expected more than 0, at most 1000"));
+    if !RATES.contains(&max_fps) {
+        let (least, most) = (RATES.start(), RATES.end());
+        return refuse(format!("{max_fps:?} images per second requested, expected {least} to {most}"));
+    }
+    // Drawing computes in single precision, where larger or smaller numbers are infinite or zero.
+    let intrinsics = &camera.intrinsics;
+    let (focal, center) = (intrinsics.focal_px, intrinsics.center_px);
+    let largest = |numbers: &[f64]| numbers.iter().fold(0.0, |largest: f64, number| largest.max(number.abs()));
+    let distance = largest(&camera.camera_from_world.translation.to_array());
+    for (what, value, range, unit) in [
+        ("focal length fx", focal.x, 0.1..=1e7, " pixels"),
+        ("focal length fy", focal.y, 0.1..=1e7, " pixels"),
+        ("offset of the principal point", largest(&center.to_array()), 0.0..=1e6, " pixels"),
+        ("distance from the origin", distance, 0.0..=1e5, " m"),
+        ("largest lens coefficient", largest(&intrinsics.lens.coefficients()), 0.0..=1e6, ""),
+    ] {
+        if !range.contains(&value) {
+            let (least, most) = (range.start(), range.end());
+            return refuse(format!("{what} of {value:?}{unit} requested, expected {least} to {most}{unit}"));
+        }
     }
     Ok(())
 }
@@ -94,17 +118,32 @@ pub(crate) fn check_camera(topic: &str, camera: &Camera, max_fps: f64) -> Result
 struct Lease {
     viewpoint: Viewpoint,
     ends: Instant,
-    /// Time at which the next image is due; `None` before the first.
+    /// Time at which the next image is due; `None` before the viewpoint is watched.
     next_due: Option<Instant>,
 }
 
 impl Lease {
+    /// Replaces viewpoint and end. Pixels that were earned towards the next image stay earned at another size or rate.
+    fn renew(&mut self, viewpoint: Viewpoint, ends: Instant, now: Instant) {
+        let before = std::mem::replace(&mut self.viewpoint, viewpoint);
+        self.ends = ends;
+        let is_same = [pixels, pixel_rate].map(|of| of(&before).total_cmp(&of(&self.viewpoint)).is_eq()) == [true; 2];
+        if let Some(due) = self.next_due.filter(|_| !is_same) {
+            let missing = due.saturating_duration_since(now).as_secs_f64() * pixel_rate(&before);
+            let earned = (pixels(&before) - missing).max(0.0);
+            let missing = (pixels(&self.viewpoint) - earned).max(0.0);
+            self.next_due = now.checked_add(saturating_secs(missing / pixel_rate(&self.viewpoint)));
+        }
+    }
+
     /// Returns whether an image is due, and schedules the next one a period later.
-    fn take_due(&mut self, now: Instant) -> bool {
-        let period = Duration::from_secs_f64(1.0 / self.viewpoint.max_fps);
+    fn take_due(&mut self, first_images: &mut FirstImages, now: Instant) -> bool {
+        let period = saturating_secs(1.0 / self.viewpoint.max_fps);
         let Some(due) = self.next_due else {
-            self.next_due = now.checked_add(period);
-            return true;
+            let is_first = first_images.take(&self.viewpoint.subscriber, now);
+            // One that waits does so for a whole period, not for one that may be a little early.
+            self.next_due = now.checked_add(if is_first { period } else { period + period / 8 });
+            return is_first;
         };
         // A frame set of the same rate that is a little early must not lose its image.
         if now + period / 8 < due {
@@ -132,6 +171,7 @@ pub(crate) struct Leases {
     lease: Duration,
     pixels_per_second: u64,
     max_view_pixels: u64,
+    first_images: FirstImages,
     pub granted: u64,
     pub refused: u64,
     pub expired: u64,
@@ -146,10 +186,17 @@ impl Leases {
             lease,
             pixels_per_second,
             max_view_pixels: u64::MAX,
+            first_images: FirstImages::default(),
             granted: 0,
             refused: 0,
             expired: 0,
         }
+    }
+
+    /// Chooses whether subscribers hold keys, so that each holder has first images of its own.
+    pub(crate) fn with_keys(mut self, has_keys: bool) -> Self {
+        self.first_images.has_keys = has_keys;
+        self
     }
 
     /// Grants, renews, releases or refuses a viewpoint.
@@ -184,10 +231,10 @@ impl Leases {
             self.active.retain(|lease| lease.viewpoint.subscriber != subscriber);
             return Ok(());
         };
-        check_camera(&topic, &camera, max_fps)?;
-        let mut name = camera.id.to_string();
+        let mut name: String = camera.id.as_str().chars().take(MAX_CAMERA_NAME).collect();
         clean(&mut name);
         camera.id = name.into();
+        check_camera(&topic, &camera, max_fps)?;
         let viewpoint = Viewpoint {
             subscriber: subscriber.to_owned(),
             view: format!("{}{subscriber}", keys::VIEWER_PREFIX),
@@ -203,7 +250,7 @@ impl Leases {
         self.check_pixels(&topic, &viewpoint)?;
         let ends = now + self.lease;
         if let Some(lease) = self.active.iter_mut().find(|lease| lease.viewpoint.subscriber == subscriber) {
-            *lease = Lease { viewpoint, ends, next_due: lease.next_due };
+            lease.renew(viewpoint, ends, now);
             return Ok(());
         }
         if self.active.len() >= self.max_viewers {
@@ -282,9 +329,30 @@ impl Leases {
 
     /// Takes the watched viewpoints whose next image is due.
     pub(crate) fn take_due(&mut self, now: Instant, is_watched: impl Fn(&str) -> bool) -> Vec<Viewpoint> {
+        self.take_due_with(now, is_watched, Lease::take_due)
+    }
+
+    /// Takes the watched viewpoints that are due by `schedule`; one for which it panics ends.
+    fn take_due_with(
+        &mut self,
+        now: Instant,
+        is_watched: impl Fn(&str) -> bool,
+        schedule: impl Fn(&mut Lease, &mut FirstImages, Instant) -> bool,
+    ) -> Vec<Viewpoint> {
         self.expire(now);
-        let due = self.active.iter_mut().filter(|lease| is_watched(&lease.viewpoint.view));
-        due.filter_map(|lease| lease.take_due(now).then(|| lease.viewpoint.clone())).collect()
+        let (mut due, mut panics) = (Vec::new(), Vec::new());
+        for lease in self.active.iter_mut().filter(|lease| is_watched(&lease.viewpoint.view)) {
+            match caught(|| schedule(lease, &mut self.first_images, now)) {
+                Ok(true) => due.push(lease.viewpoint.clone()),
+                Ok(false) => {}
+                Err(panic) => panics.push((lease.viewpoint.subscriber.clone(), panic)),
+            }
+        }
+        for (subscriber, panic) in panics {
+            tracing::error!(viewer = subscriber, "scheduling a viewpoint panicked: {panic}");
+            self.refuse(&subscriber, &format!("its schedule cannot be computed: {panic}"), now);
+        }
+        due
     }
 
     /// Forgets a subscriber that has left.
@@ -327,173 +395,5 @@ fn mega(pixels: f64) -> String {
 }
 
 #[cfg(test)]
-mod tests {
-    use flyrig_types::{Intrinsics, Isometry, Lens};
-    use glam::DVec2;
-
-    use super::*;
-
-    const LEASE: Duration = Duration::from_secs(3);
-    const BUDGET: u64 = 512 * 512 * 30 * 4;
-
-    fn leases() -> Leases {
-        Leases::new(8, LEASE, BUDGET)
-    }
-
-    fn camera(width: u32, height: u32) -> Camera {
-        Camera {
-            time_offset_nanos: 0,
-            color: Default::default(),
-            id: "mine".into(),
-            intrinsics: Intrinsics {
-                width,
-                height,
-                focal_px: DVec2::splat(500.0),
-                center_px: DVec2::new(f64::from(width), f64::from(height)) / 2.0,
-                lens: Lens::PINHOLE,
-            },
-            camera_from_world: Isometry::IDENTITY,
-        }
-    }
-
-    /// Returns the reason of a refusal; empty when granted.
-    fn ask(leases: &mut Leases, who: &str, (width, height): (u32, u32), max_fps: f64, now: Instant) -> String {
-        let request = ViewpointRequest { camera: Some(camera(width, height)), max_fps };
-        let answer = leases.ask(who, Ok(request), now);
-        assert_eq!(answer.granted, answer.reason.is_empty());
-        answer.reason
-    }
-
-    #[test]
-    fn the_budget_of_pixels_is_shared_and_a_refusal_names_what_fits() {
-        let (mut leases, now) = (leases(), Instant::now());
-        // Four viewers of the usual size fill it to the pixel, and each may renew and move.
-        for round in 0..3 {
-            for who in ["a", "b", "c", "d"] {
-                assert_eq!(ask(&mut leases, who, (512, 512), 30.0, now), "", "{who} {round}");
-            }
-        }
-        let full = ask(&mut leases, "e", (512, 512), 30.0, now);
-        assert!(
-            full.contains("512x512 at 30 per second is 7.9 Mpx/s; 0.0 of the rig's 31.5 Mpx/s are left; wait"),
-            "{full}"
-        );
-        // One that leaves makes room; a larger one learns which sizes fit, and both of them do.
-        leases.drop_subscriber("d");
-        let large = ask(&mut leases, "e", (1024, 1024), 30.0, now);
-        assert!(large.contains("1024x1024 at 30 per second is 31.5 Mpx/s; 7.9 of the rig's 31.5 Mpx/s"), "{large}");
-        assert!(large.ends_with("ask for 512x512 or --max-fps 7"), "{large}");
-        assert_eq!(ask(&mut leases, "e", (1024, 1024), 7.0, now), "");
-        leases.drop_subscriber("e");
-        assert_eq!(ask(&mut leases, "e", (512, 512), 30.0, now), "");
-        // A subscriber that requests more keeps the granted viewpoint, and takes nothing from the others.
-        assert!(!ask(&mut leases, "e", (513, 512), 30.0, now).is_empty());
-        let rates: Vec<f64> = leases.viewpoints().iter().map(pixel_rate).collect();
-        assert_eq!(rates, [512.0 * 512.0 * 30.0; 4]);
-        for who in ["a", "b", "c"] {
-            assert_eq!(ask(&mut leases, who, (512, 512), 30.0, now), "");
-        }
-        // A lease that ends gives its pixels back.
-        assert_eq!(ask(&mut leases, "f", (1024, 1024), 30.0, now + LEASE), "");
-        // More than everything.
-        let huge = ask(&mut leases, "f", (4096, 4096), 1000.0, now + LEASE);
-        assert!(huge.contains("16777.2 Mpx/s; 31.5 of") && huge.ends_with("ask for 177x177 or --max-fps 1"), "{huge}");
-        assert!(ask(&mut Leases::new(8, LEASE, 0), "a", (64, 64), 30.0, now).contains("raise viewpoint-pixels"));
-    }
-
-    #[test]
-    fn images_too_large_for_the_rig_are_refused_and_ended() {
-        let (mut leases, now) = (Leases::new(8, LEASE, u64::MAX), Instant::now());
-        assert_eq!(ask(&mut leases, "a", (4096, 4096), 30.0, now), "");
-        assert_eq!(ask(&mut leases, "b", (2048, 1024), 30.0, now), "");
-        leases.set_max_view_pixels(8 << 20);
-        assert_eq!(leases.viewpoints().iter().map(|v| v.subscriber.as_str()).collect::<Vec<_>>(), ["b"]);
-        let reason = ask(&mut leases, "a", (4096, 4096), 30.0, now);
-        assert!(
-            reason.ends_with("4096x4096 is 16.8 Mpx, the rig draws at most 8.4 Mpx; ask for 2896x2896"),
-            "{reason}"
-        );
-        assert_eq!(ask(&mut leases, "a", (2896, 2896), 30.0, now), "");
-    }
-
-    #[test]
-    fn what_could_not_be_drawn_is_refused_until_it_changes_or_a_minute_has_passed() {
-        let (mut leases, now) = (leases(), Instant::now());
-        for who in ["a", "b"] {
-            assert_eq!(ask(&mut leases, who, (512, 512), 30.0, now), "");
-        }
-        leases.refuse("a", "out of memory\u{1b}[2J", now);
-        leases.refuse("nobody", "x", now);
-        assert_eq!(leases.viewpoints().len(), 1);
-        for seconds in [0, 1, 59] {
-            let reason = ask(&mut leases, "a", (512, 512), 30.0, now + Duration::from_secs(seconds));
-            assert_eq!(reason, "viewpoint of a: out of memory\\u{1b}[2J");
-            assert_eq!(ask(&mut leases, "b", (512, 512), 30.0, now + Duration::from_secs(seconds)), "");
-        }
-        assert_eq!(ask(&mut leases, "a", (512, 512), 30.0, now + REFUSAL), "");
-        // Another size is another request, and the first one may be tried again after it.
-        leases.refuse("a", "out of memory", now + REFUSAL);
-        assert_eq!(ask(&mut leases, "a", (256, 256), 30.0, now + REFUSAL), "");
-        assert_eq!(ask(&mut leases, "a", (512, 512), 30.0, now + REFUSAL), "");
-        // Any number of refusals is remembered within bounds.
-        for n in 0..1000 {
-            let who = format!("n{n}");
-            assert_eq!(ask(&mut leases, &who, (64, 64), 1.0, now + REFUSAL), "");
-            leases.refuse(&who, "x", now + REFUSAL);
-        }
-        assert_eq!(leases.refusals.len(), MAX_REFUSALS);
-    }
-
-    /// Returns the number of images of each viewer in 20 s of a rig of `rig_fps`, whose frame sets are up to `jitter` of an interval early
-    /// or late.
-    fn pictures(rates: &[f64], rig_fps: f64, jitter: f64) -> Vec<usize> {
-        let (mut leases, start) = (Leases::new(8, LEASE, u64::MAX), Instant::now());
-        let mut counts = vec![0; rates.len()];
-        let mut random = 7u64;
-        for set in 0..(20.0 * rig_fps) as u32 {
-            random = random.wrapping_mul(6_364_136_223_846_793_005).wrapping_add(1_442_695_040_888_963_407);
-            let shift = ((random >> 33) as f64 / f64::from(1u32 << 31) * 2.0 - 1.0) * jitter;
-            let now = start + Duration::from_secs_f64((f64::from(set) + 1.0 + shift) / rig_fps);
-            for (n, max_fps) in rates.iter().enumerate() {
-                assert_eq!(ask(&mut leases, &n.to_string(), (64, 64), *max_fps, now), "");
-            }
-            for viewpoint in leases.take_due(now, |_| true) {
-                counts[viewpoint.subscriber.parse::<usize>().unwrap()] += 1;
-            }
-        }
-        counts
-    }
-
-    #[test]
-    fn every_viewer_gets_its_own_rate() {
-        for jitter in [0.0, 0.1, 0.3, 0.49] {
-            // 20 s of a rig at 30 frame sets per second: 600.
-            let counts = pictures(&[30.0, 20.0, 7.5, 1.0, 1000.0, 29.0], 30.0, jitter);
-            for (count, wanted) in counts.iter().zip([600, 400, 150, 20, 600, 580]) {
-                assert!(count.abs_diff(wanted) <= 2, "jitter {jitter}: {counts:?}");
-            }
-        }
-        // A rig that is faster than asked for by any ratio.
-        assert!(pictures(&[30.0], 47.0, 0.3)[0].abs_diff(600) <= 2);
-    }
-
-    #[test]
-    fn no_image_is_drawn_for_a_viewer_that_does_not_watch_or_to_make_up_for_a_pause() {
-        let (mut leases, now) = (leases(), Instant::now());
-        assert_eq!(ask(&mut leases, "a", (64, 64), 10.0, now), "");
-        assert_eq!(ask(&mut leases, "b", (64, 64), 10.0, now), "");
-        let due = |leases: &mut Leases, millis, watched: &str| -> Vec<String> {
-            let now = now + Duration::from_millis(millis);
-            leases.take_due(now, |view| view == watched).into_iter().map(|viewpoint| viewpoint.subscriber).collect()
-        };
-        assert_eq!(due(&mut leases, 0, "viewer-a"), ["a"]);
-        assert!(due(&mut leases, 50, "viewer-a").is_empty());
-        assert_eq!(due(&mut leases, 60, "viewer-b"), ["b"]);
-        assert_eq!(due(&mut leases, 100, "viewer-a"), ["a"]);
-        // After a pause of one second, the next second has ten images, without the ten that were missed.
-        let taken: usize = (0..100).map(|n| due(&mut leases, 1100 + 10 * n, "viewer-a").len()).sum();
-        assert!((10..=12).contains(&taken), "{taken}");
-        // The lease ends, as everywhere.
-        assert!(due(&mut leases, 3000, "viewer-a").is_empty());
-    }
-}
+#[path = "viewpoint_tests.rs"]
+mod tests;

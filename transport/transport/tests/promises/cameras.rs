@@ -42,7 +42,7 @@ fn subscriber(rig: &str, cameras: &[&str], endpoints: &[String]) -> CameraSubscr
     CameraSubscriber::open(&config, &cameras, our_clock()).unwrap()
 }
 
-fn frame(camera: &str, sequence: u64) -> Frame {
+pub fn frame(camera: &str, sequence: u64) -> Frame {
     let (format, bytes) = match sequence % 2 {
         0 => (PixelFormat::Mjpeg, vec![sequence as u8; 3000 + sequence as usize]),
         _ => (PixelFormat::Yuyv, vec![sequence as u8; 4 * 2 * 2]),
@@ -175,6 +175,31 @@ fn rigs_of_one_network_do_not_mix_and_a_wrong_name_is_told() {
     assert!(of_three.next_frame(&"a".into(), Duration::ZERO).unwrap().is_none());
 }
 
+/// Returns the name in topics of the only computer whose name begins so, from a program of the rig's computer.
+pub fn spy_on_host(endpoint: &str, start: &str) -> String {
+    let session = stranger(&[endpoint.to_owned()]);
+    wait_for("the computer's name", || {
+        let found = session.liveliness().get("flyrig/v1/test/host/*").wait().unwrap();
+        let mut names = found.iter().filter_map(|reply| {
+            let name = reply.result().ok()?.key_expr().as_str().rsplit('/').next()?.to_owned();
+            name.starts_with(start).then_some(name)
+        });
+        names.next()
+    })
+}
+
+/// Returns the publisher of this name, as headers state it.
+pub fn publisher_of(name: &str) -> u64 {
+    name.bytes().fold(0xcbf2_9ce4_8422_2325, |hash, b| (hash ^ u64::from(b)).wrapping_mul(0x0100_0000_01b3))
+}
+
+/// Returns the attachment of a grey image taken now, by a clock that is this far ahead.
+pub fn gray_header(sequence: u64, publisher: u64, ahead_nanos: i64) -> Vec<u8> {
+    let good = good_header(sequence);
+    let capture_nanos = now_nanos() + ahead_nanos;
+    FrameHeader { header: Header { publisher, capture_nanos, ..good.header }, ..good }.encode().to_vec()
+}
+
 /// A session that says what it likes.
 fn stranger(endpoints: &[String]) -> zenoh::Session {
     let mut config = zenoh::Config::default();
@@ -197,6 +222,7 @@ fn good_header(sequence: u64) -> FrameHeader {
             frame: sequence,
             capture_nanos: host_clock().now_nanos(),
             publish_unix_nanos: 0,
+            publish_nanos: 0,
             host: 1,
             publisher: 0x666,
             width: 4,

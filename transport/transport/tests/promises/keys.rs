@@ -27,12 +27,16 @@ use crate::{
 
 /// A new ring at a port that is free, and so is the next.
 fn ring() -> (TempDir, Ring) {
+    ring_at("127.0.0.1")
+}
+
+fn ring_at(host: &str) -> (TempDir, Ring) {
     let folder = tempfile::tempdir().unwrap();
     let port = wait_for("two free ports", || {
         let port = TcpListener::bind("0.0.0.0:0").unwrap().local_addr().unwrap().port();
         TcpListener::bind(("0.0.0.0", port.checked_add(1)?)).is_ok().then_some(port)
     });
-    let ring = Ring::create(&folder.path().join("keys"), "test", &["127.0.0.1".to_owned()], port).unwrap();
+    let ring = Ring::create(&folder.path().join("keys"), "test", &[host.to_owned()], port).unwrap();
     (folder, ring)
 }
 
@@ -115,6 +119,22 @@ fn a_key_is_all_that_a_viewer_needs() {
     // It leaves no trace.
     drop(viewer);
     wait_until("the end of its viewpoint", || rig.requested_viewpoints().is_empty());
+}
+
+#[test]
+fn a_rig_is_reached_by_ipv6_and_at_the_same_port_by_ipv4() {
+    if TcpListener::bind("[::1]:0").is_err() {
+        return eprintln!("this computer has no IPv6");
+    }
+    let (_folder, mut ring) = ring_at("::1");
+    let rig = open_rig(&ring);
+    let key = ring.add("desk", Role::Viewer, 10).unwrap();
+    key.knock().unwrap();
+    let viewer = open_viewer(&key, &everything());
+    publish_until_seen(&rig, &viewer, "main", &mut 0);
+    assert_eq!(viewer.trouble(), None);
+    let port = rig.gate().unwrap().port();
+    std::net::TcpStream::connect((Ipv4Addr::LOCALHOST, port)).unwrap();
 }
 
 #[test]
@@ -268,6 +288,92 @@ fn cameras_of_another_computer_need_a_key_alone_and_read_nothing() {
     wait_until("the word that it is gone", || there.absence(&"a".into()).contains("has left the network"));
     let trouble = wait_for("the reason", || here.trouble());
     assert!(trouble.contains("it was revoked"), "{trouble}");
+}
+
+/// A camera computer that sends what it likes, at a rig that has another camera of another computer.
+#[test]
+fn a_camera_key_sends_its_own_cameras_and_answers_for_its_own_clock() {
+    let (folder, mut ring) = ring();
+    let mut add = |name: &str, camera: &str| {
+        let file = folder.path().join(format!("{name}.key"));
+        ring.add_file(&file, name, Role::Cameras, &[camera.to_owned()], 10).unwrap()
+    };
+    let (left, right) = (add("left-pc", "left"), add("right-pc", "right"));
+    let endpoint = free_endpoint();
+    let config = TransportConfig {
+        keys: ring.folder().to_owned(),
+        listen: vec![endpoint.clone()],
+        ..TransportConfig::publisher("test")
+    };
+    let cameras = ["left".into(), "right".into()];
+    let there = CameraSubscriber::open(&config, &cameras, our_clock()).unwrap();
+    let refused = CameraPublisher::open(&TransportConfig::with_key(left.clone()), &cameras, host_clock()).unwrap_err();
+    assert!(refused.to_string().contains("camera right: the key of 'left-pc' is for left"), "{refused}");
+    let honest = CameraPublisher::open(&TransportConfig::with_key(right.clone()), &cameras[1..], host_clock()).unwrap();
+    let mut sequence = 0;
+    cameras::publish_until_seen(&honest, &there, "right", &mut sequence);
+    let host = cameras::spy_on_host(&endpoint, &right.topic_name);
+
+    let outlaw = outlaw(&left);
+    let (own, its) = (format!("{}.{}", left.topic_name, outlaw.zid()), right.topic_name.clone());
+    // It answers for every clock, and claims to be every computer.
+    let asked = Arc::<AtomicU64>::default();
+    let mut tokens = Vec::new();
+    for name in [own.as_str(), &format!("{its}.*"), &host, "*", "ab12"] {
+        let (count, is_own) = (asked.clone(), name == own);
+        let lie = move |query: zenoh::query::Query| {
+            if !is_own {
+                count.fetch_add(1, Ordering::Relaxed);
+            }
+            let _ = query.reply(query.key_expr(), (cameras::now_nanos() + 7_000_000_000).to_le_bytes()).wait();
+        };
+        outlaw.declare_queryable(format!("flyrig/v1/test/clock/{name}")).callback(lie).background().wait().unwrap();
+        if !name.contains('*') {
+            let token = format!("flyrig/v1/test/host/{name}");
+            tokens.push(outlaw.liveliness().declare_token(token).wait().unwrap());
+        }
+    }
+    // It sends as the other camera under every name, with the publisher of the honest computer as well; and its own camera.
+    let names = |camera: &str| {
+        ["camera", "camera-status"].map(|kind| {
+            [String::new(), format!("/{own}"), format!("/{host}"), format!("/{its}.x"), "/ab12".to_owned()]
+                .map(|end| format!("flyrig/v1/test/{kind}/{camera}{end}"))
+        })
+    };
+    let keys: Vec<String> =
+        ["right", "*", "$*right"].into_iter().flat_map(|camera| names(camera).into_iter().flatten()).collect();
+    let (right_id, left_id) = (&cameras[1], &cameras[0]);
+    let before = there.link(right_id);
+    let end = Instant::now() + Duration::from_secs(3);
+    let mut forged = 0u64;
+    while Instant::now() < end || there.link(left_id).frames < 5 {
+        assert!(Instant::now() < end + PATIENCE, "its own camera does not come: {:?}", there.link(left_id));
+        forged += 1;
+        for publisher in [cameras::publisher_of(&host), 0x666] {
+            let attachment = cameras::gray_header(1_000_000 + forged, publisher, 7_000_000_000);
+            for key in &keys {
+                outlaw.put(key, vec![9; 8]).attachment(attachment.clone()).wait().unwrap();
+            }
+        }
+        let attachment = cameras::gray_header(forged, cameras::publisher_of(&host), 7_000_000_000);
+        outlaw.put(format!("flyrig/v1/test/camera/left/{own}"), vec![7; 8]).attachment(attachment).wait().unwrap();
+        let frame = cameras::publish_until_seen(&honest, &there, "right", &mut sequence);
+        assert!(frame.sequence < 1_000_000 && frame.image.bytes() != [9; 8], "a forged image");
+        let late = (cameras::now_nanos() - frame.capture_nanos).abs();
+        assert!(late < 2_000_000_000, "timed by another computer's clock, {late} ns");
+        while let Some(own) = there.next_frame(left_id, Duration::ZERO).unwrap() {
+            let late = (cameras::now_nanos() - own.capture_nanos).abs();
+            assert!(own.image.bytes() == [7; 8] && late < 2_000_000_000, "timed by its own clock, {late} ns");
+        }
+    }
+    let link = there.link(right_id);
+    assert_eq!((link.refused, link.restarts, link.status), (before.refused, before.restarts, before.status));
+    assert_eq!(asked.load(Ordering::Relaxed), 0, "it is not even asked for another clock");
+    // Keys of earlier versions name no cameras and may send each.
+    let old = ring.add("old", Role::Cameras, 10).unwrap();
+    drop(honest);
+    let old = CameraPublisher::open(&TransportConfig::with_key(old), &cameras, host_clock()).unwrap();
+    cameras::publish_until_seen(&old, &there, "right", &mut 0);
 }
 
 #[test]

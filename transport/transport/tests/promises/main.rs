@@ -9,6 +9,7 @@ mod keys;
 mod malformed;
 mod people;
 mod processes;
+mod routers;
 mod sessions;
 mod splats;
 mod support;

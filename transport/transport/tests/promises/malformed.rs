@@ -24,6 +24,7 @@ fn header(kind: MessageKind) -> Header {
         frame: 1,
         capture_nanos: 0,
         publish_unix_nanos: 0,
+        publish_nanos: 0,
         host: 0,
         publisher: 1,
         width: 64,

@@ -4,10 +4,11 @@ use std::{
     io::{BufRead, BufReader, Write},
     process::{Child, Command, Stdio},
     sync::{
-        Arc,
-        atomic::{AtomicU64, Ordering},
+        Arc, Mutex,
+        atomic::{AtomicBool, AtomicU64, Ordering},
     },
-    time::Duration,
+    thread::JoinHandle,
+    time::{Duration, Instant},
 };
 
 use flyrig_transport::{Interests, Publisher, Subscriber, Views};
@@ -160,4 +161,95 @@ fn a_paused_watcher_slows_no_other_and_catches_up_with_the_newest_frame() {
         watcher.newest() > target && publisher.requested_viewpoints().len() == 1
     });
     assert!(watcher.newest() > paused);
+}
+
+/// Latencies of a viewer, milliseconds, as long as its owner lives.
+struct Latencies {
+    stop: Arc<AtomicBool>,
+    thread: Option<JoinHandle<()>>,
+    millis: Arc<Mutex<Vec<f64>>>,
+}
+
+impl Latencies {
+    fn start(subscriber: Subscriber) -> Self {
+        let (stop, millis) = (Arc::<AtomicBool>::default(), Arc::<Mutex<Vec<f64>>>::default());
+        let (stopped, noted) = (stop.clone(), millis.clone());
+        let work = move || {
+            while !stopped.load(Ordering::Relaxed) {
+                if let Ok(Some(received)) = subscriber.next_view(Duration::from_millis(50)) {
+                    noted.lock().unwrap().push(received.latency_nanos as f64 / 1e6);
+                }
+            }
+        };
+        let thread = std::thread::Builder::new().name("latencies".to_owned()).spawn(work).unwrap();
+        Self { stop, thread: Some(thread), millis }
+    }
+
+    /// Takes the latencies since the last call; returns number, median and 99th percentile.
+    fn take(&self) -> (usize, f64, f64) {
+        let mut millis = std::mem::take(&mut *self.millis.lock().unwrap());
+        millis.sort_by(f64::total_cmp);
+        (millis.len(), millis[millis.len() / 2], millis[millis.len() * 99 / 100])
+    }
+}
+
+impl Drop for Latencies {
+    fn drop(&mut self) {
+        self.stop.store(true, Ordering::Relaxed);
+        self.thread.take().into_iter().for_each(|thread| thread.join().unwrap());
+    }
+}
+
+/// Returns the resident memory of this process, MB.
+fn resident_mb() -> f64 {
+    let status = std::fs::read_to_string("/proc/self/status").unwrap();
+    let line = status.lines().find_map(|line| line.strip_prefix("VmRSS:")).unwrap();
+    line.trim().trim_end_matches(" kB").parse::<f64>().unwrap() * 1024.0 / 1e6
+}
+
+/// Publishes 30 times per second for `secs`; returns the most memory meanwhile, MB.
+fn publish_for(publisher: &Publisher, frame: &mut u64, secs: u64) -> f64 {
+    let (begun, mut most) = (Instant::now(), 0.0f64);
+    for turn in 0..30 * secs as u32 {
+        publish(publisher, frame);
+        for layer in [None, Some(0), Some(1), Some(2)] {
+            let stamp = flyrig_stream::Stamp { frame: *frame, ..Default::default() };
+            publisher.publish_person(&stamp, layer, vec![7; 6000].into());
+        }
+        most = most.max(resident_mb());
+        std::thread::sleep((begun + turn * Duration::from_micros(33_333)).saturating_duration_since(Instant::now()));
+    }
+    most
+}
+
+#[test]
+#[cfg(target_os = "linux")]
+#[ignore = "takes three minutes"]
+fn a_viewer_that_is_stopped_for_a_minute_costs_the_others_neither_latency_nor_memory() {
+    let publisher = open_publisher(|_| {});
+    let front = || Interests { views: Views::Named(vec!["front".into()]), ..Interests::default() };
+    let latencies = Latencies::start(open_subscriber(&publisher, &front()));
+    let watcher = Watcher::start(&publisher);
+    let mut frame = 0;
+    wait_until("the watcher's first frame", || {
+        publish(&publisher, &mut frame);
+        watcher.newest() > 0
+    });
+    publish_for(&publisher, &mut frame, 10);
+    latencies.take();
+    let before_mb = publish_for(&publisher, &mut frame, 60);
+    let (count, median, before) = latencies.take();
+    println!("all viewers up: {count} images, median {median:.2} ms, p99 {before:.2} ms, {before_mb:.1} MB");
+    watcher.signal("-STOP");
+    // The first seconds, until zenoh ends the session of the stopped viewer, and the rest.
+    let stopped_mb = publish_for(&publisher, &mut frame, 12);
+    let (count, median, stalled) = latencies.take();
+    println!("one stopped, 0 to 12 s: {count} images, median {median:.2} ms, p99 {stalled:.2} ms, {stopped_mb:.1} MB");
+    let later_mb = publish_for(&publisher, &mut frame, 48);
+    let (count, median, later) = latencies.take();
+    println!("one stopped, 12 to 60 s: {count} images, median {median:.2} ms, p99 {later:.2} ms, {later_mb:.1} MB");
+    watcher.signal("-CONT");
+    assert!(stopped_mb.max(later_mb) <= before_mb + 50.0, "{before_mb} MB, then {stopped_mb} and {later_mb}");
+    // Other programs of a busy machine add a millisecond to any of these; a publisher that waited for the viewer would add fifty.
+    assert!(stalled.max(later) <= 1.05 * before + 1.0, "{before} ms, then {stalled} and {later}");
 }

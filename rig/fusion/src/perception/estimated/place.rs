@@ -1,6 +1,6 @@
 //! One person who is tracked, or a free place for one who may come.
 
-use std::{thread::JoinHandle, time::Duration};
+use std::thread::JoinHandle;
 
 use flyrig_body::{Outfit, Template};
 use flyrig_tracker::{HandTracker, PoseEstimate, PoseEstimator, ShapeFit, ShapeSighting, TrackError, TrackErrorKind};
@@ -193,7 +193,7 @@ impl PersonPlace {
     pub fn with_hands(&mut self, set: &FrameSet, pose: Pose, stages: &mut StageTimes) -> Result<Pose, TrackError> {
         let Some(hands) = &mut self.hands else { return Ok(pose) };
         let (pose, quality) = hands.estimate(set, &pose)?;
-        let [net, fit] = quality.seconds.map(|seconds| Duration::from_secs_f64(seconds.max(0.0)));
+        let [net, fit] = quality.seconds.map(flyrig_types::saturating_secs);
         stages.add("  hands and face: networks", net);
         stages.add("  hands and face: fit", fit);
         stages.count("crops of hands", quality.crops[0] as u64);

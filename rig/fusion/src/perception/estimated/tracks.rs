@@ -1,7 +1,5 @@
 //! Assignment of people to places: following, searching, recognizing and losing them.
 
-use std::time::Duration;
-
 use flyrig_tracker::PoseEstimate;
 use flyrig_types::{FrameSet, Mask};
 
@@ -144,7 +142,7 @@ fn count_stages(estimate: &PoseEstimate, stages: &mut StageTimes) {
         ("  masks", seconds.masks),
         ("  fit to outlines", seconds.outline),
     ] {
-        stages.add(stage, Duration::from_secs_f64(seconds.max(0.0)));
+        stages.add(stage, flyrig_types::saturating_secs(seconds));
     }
     stages.count("pose network inferences", estimate.quality.inferred as u64);
 }

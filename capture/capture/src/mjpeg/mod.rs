@@ -1,5 +1,11 @@
 //! JPEG images from cameras: often without Huffman tables, sometimes padded, sometimes damaged.
 
+mod guard;
+mod scan;
+mod shifts;
+#[cfg(test)]
+mod testing;
+
 use zune_jpeg::{
     JpegDecoder,
     zune_core::{bytestream::ZCursor, colorspace::ColorSpace, options::DecoderOptions},
@@ -8,8 +14,10 @@ use zune_jpeg::{
 use crate::error::{CaptureError, CaptureErrorKind};
 use crate::image_file;
 
-/// Decodes into `rgb`, `3 * width * height` bytes. Strict: damage that a lenient decoder fills with grey is an error,
-/// so that a broken image never colours a person.
+use guard::Guard;
+
+/// Decodes into `rgb`, `3 * width * height` bytes. Strict: damage that a lenient decoder fills with grey, and damage
+/// that decodes but shows in the data, is an error, so that a broken image never colours a person.
 ///
 /// # Errors
 /// `Corrupt` for any fault in the bytes.
@@ -28,7 +36,11 @@ pub(crate) fn decode(
         return Err(corrupt("is a JPEG image that is cut off".to_owned()));
     }
     let damaged = |error: &dyn std::fmt::Display| corrupt(format!("is a damaged JPEG image ({error})"));
-    let whole = if scratch.complete(bytes) { &scratch.0 } else { bytes };
+    let whole = if scratch.complete(bytes) { &scratch.completed } else { bytes };
+    match &mut scratch.guard {
+        Some(guard) => guard.check(whole, segments(whole)).map_err(|damage| damaged(&damage))?,
+        None => scan::walk(whole, segments(whole)).map(drop).map_err(|fault| damaged(&fault))?,
+    }
     let options = DecoderOptions::default()
         .set_strict_mode(true)
         .set_max_width(width)
@@ -84,9 +96,17 @@ pub(crate) fn jpeg_size(bytes: &[u8]) -> Option<(usize, usize)> {
 
 /// Scratch memory that is reused from image to image.
 #[derive(Debug, Default)]
-pub(crate) struct JpegScratch(Vec<u8>);
+pub(crate) struct JpegScratch {
+    completed: Vec<u8>,
+    guard: Option<Guard>,
+}
 
 impl JpegScratch {
+    /// Creates scratch memory for the images of one camera in their order, which are compared with each other.
+    pub fn of_camera() -> Self {
+        Self { guard: Some(Guard::default()), ..Self::default() }
+    }
+
     /// Inserts the standard Huffman tables before the scan of an image without its own: USB cameras omit them. Returns
     /// false where nothing is missing.
     fn complete(&mut self, bytes: &[u8]) -> bool {
@@ -99,7 +119,7 @@ impl JpegScratch {
             }
         }
         let Some(scan) = scan else { return false };
-        let completed = &mut self.0;
+        let completed = &mut self.completed;
         completed.clear();
         completed.extend_from_slice(&bytes[..scan]);
         for (class, counts, values) in [

@@ -1,0 +1,240 @@
+//! Number and times of the frames of videos whose header promises something else.
+
+#![allow(clippy::unwrap_used, clippy::panic, reason = "helpers of tests")]
+
+use std::{fs, fs::File, path::Path, time::Duration};
+
+use ac_ffmpeg::{
+    codec::{
+        AudioCodecParameters, CodecParameters, Encoder as _,
+        audio::ChannelLayout,
+        video::{PixelFormat as FramePixels, VideoEncoder, VideoFrameMut},
+    },
+    format::{
+        io::IO,
+        muxer::{Muxer, OutputFormat},
+    },
+    packet::PacketMut,
+    time::{TimeBase, Timestamp},
+};
+use flyrig_capture::{CameraSource, CaptureErrorKind, VideoOptions, VideoReplay};
+
+/// Time base of the films: 1 ms.
+fn millis() -> TimeBase {
+    TimeBase::new(1, 1000)
+}
+
+/// Film of 64x48 pixels whose frame `i` has the luma `60 + 3 i` in its left half.
+struct Film<'a> {
+    container: &'a str,
+    codec: &'a str,
+    /// Largest number of consecutive frames that are stored after a later one.
+    reordered: u32,
+    /// Presentation times, milliseconds.
+    times: Vec<i64>,
+    /// Length of the sound track, milliseconds; none for 0.
+    sound: i64,
+    muxing: &'a [(&'a str, &'a str)],
+}
+
+impl Film<'_> {
+    fn write(&self, path: &Path) {
+        let format: FramePixels = if self.codec == "mjpeg" { "yuvj420p" } else { "yuv420p" }.parse().unwrap();
+        let mut encoder = VideoEncoder::builder(self.codec)
+            .unwrap()
+            .pixel_format(format)
+            .width(64)
+            .height(48)
+            .time_base(millis())
+            .set_option("flags", if self.container == "mpegts" { "+qscale" } else { "+qscale+global_header" })
+            .set_option("global_quality", 236)
+            .set_option("bf", self.reordered)
+            .build()
+            .unwrap();
+        let mut builder = Muxer::builder().interleaved(true);
+        builder.add_stream(&CodecParameters::from(encoder.codec_parameters())).unwrap();
+        builder.streams_mut()[0].set_time_base(millis());
+        if self.sound > 0 {
+            let sound = AudioCodecParameters::builder("pcm_s16le")
+                .unwrap()
+                .sample_rate(8000)
+                .sample_format("s16".parse().unwrap())
+                .channel_layout(&ChannelLayout::from_channels(1).unwrap())
+                .build();
+            builder.add_stream(&CodecParameters::from(sound)).unwrap();
+        }
+        // To move the index to the front, FFmpeg opens the file again.
+        builder = builder.set_option("url", path.to_str().unwrap());
+        for (key, value) in self.muxing {
+            builder = builder.set_option(key, value);
+        }
+        let file = IO::from_seekable_write_stream(File::create(path).unwrap());
+        let mut muxer = builder.build(file, OutputFormat::find_by_name(self.container).unwrap()).unwrap();
+        let mut pass_on = |encoder: &mut VideoEncoder| {
+            while let Some(packet) = encoder.take().unwrap() {
+                // The last frame has no duration otherwise, and no player shows it.
+                let packet = packet.into_mut().with_duration(Duration::from_millis(40)).freeze();
+                muxer.push(packet.with_stream_index(0)).unwrap();
+            }
+        };
+        for (i, time) in self.times.iter().enumerate() {
+            let mut frame = VideoFrameMut::black(format, 64, 48);
+            for row in frame.planes_mut()[0].lines_mut() {
+                row[..32].fill(60 + 3 * i as u8);
+            }
+            let frame = frame.with_time_base(millis()).with_pts(Timestamp::from_millis(*time));
+            encoder.push(frame.freeze()).unwrap();
+            pass_on(&mut encoder);
+        }
+        encoder.flush().unwrap();
+        pass_on(&mut encoder);
+        for second in 0..self.sound / 1000 {
+            let packet =
+                PacketMut::new(16_000).with_time_base(millis()).with_pts(Timestamp::from_millis(1000 * second));
+            muxer.push(packet.with_dts(Timestamp::from_millis(1000 * second)).with_stream_index(1).freeze()).unwrap();
+        }
+        muxer.flush().unwrap();
+        // Some writers return their number of bytes, which the wrapper takes for an error.
+        let _ = muxer.close();
+    }
+}
+
+/// Reads a video: times in milliseconds, luma on the left, and the texts of errors.
+fn read(path: &Path) -> (Vec<f64>, Vec<u8>, Vec<String>) {
+    let mut video = VideoReplay::open(&"a".into(), path, &VideoOptions::default()).unwrap();
+    let (mut times, mut lumas, mut errors) = (Vec::new(), Vec::new(), Vec::new());
+    loop {
+        match video.next_frame(Duration::ZERO) {
+            Ok(frame) => {
+                assert_eq!(frame.sequence, times.len() as u64);
+                times.push(frame.capture_nanos as f64 * 1e-6);
+                lumas.push(frame.image.bytes()[3 * (64 * 24 + 8)]);
+            }
+            Err(error) if error.kind == CaptureErrorKind::EndOfStream => return (times, lumas, errors),
+            Err(error) => errors.push(error.to_string()),
+        }
+    }
+}
+
+fn assert_times(name: &str, path: &Path, expected: &[i64]) {
+    let (times, lumas, errors) = read(path);
+    assert!(errors.is_empty(), "{name}: {errors:?}");
+    assert_eq!(times.len(), expected.len(), "{name}");
+    let first = expected[0];
+    let worst = times.iter().zip(expected).map(|(time, own)| (time - (own - first) as f64).abs()).fold(0.0, f64::max);
+    assert!(worst <= 1.0, "{name}: times {worst:.1} ms off: {times:?}");
+    assert!(lumas.is_sorted_by(|a, b| a < b), "{name}: frames in the order in which they are shown: {lumas:?}");
+}
+
+/// Times of 40 frames: 30 per second, then 7.5.
+fn variable() -> Vec<i64> {
+    (0..40).map(|i| if i < 20 { i * 100 / 3 } else { 667 + (i - 20) * 400 / 3 }).collect()
+}
+
+#[test]
+fn every_frame_has_its_own_time_in_every_container() {
+    let dir = tempfile::tempdir().unwrap();
+    let constant: Vec<i64> = (0..40).map(|i| 40 * i).collect();
+    for (container, codec, reordered) in [
+        ("mp4", "mpeg4", 0),
+        ("mp4", "mpeg4", 2),
+        ("matroska", "mpeg4", 2),
+        ("mov", "mjpeg", 0),
+        ("mpegts", "mpeg4", 2),
+    ] {
+        for (rate, times) in [("constant", constant.clone()), ("variable", variable())] {
+            let name = format!("{container} {codec} {reordered} {rate}");
+            let path = dir.path().join("film");
+            Film { container, codec, reordered, times: times.clone(), sound: 0, muxing: &[] }.write(&path);
+            assert_times(&name, &path, &times);
+        }
+    }
+}
+
+#[test]
+fn a_header_that_promises_more_is_no_damage() {
+    let dir = tempfile::tempdir().unwrap();
+    let path = dir.path().join("film");
+    // OpenCV and others multiply the length of the whole file by the frame rate.
+    Film { container: "matroska", codec: "mpeg4", reordered: 2, times: variable(), sound: 6000, muxing: &[] }
+        .write(&path);
+    assert_times("longer sound", &path, &variable());
+    // A pipe: the length is unknown.
+    let live = [("live", "1")];
+    Film { container: "matroska", codec: "mpeg4", reordered: 0, times: variable(), sound: 0, muxing: &live }
+        .write(&path);
+    assert_times("live", &path, &variable());
+    let times: Vec<i64> = (0..40).map(|i| 40 * i).collect();
+    Film { container: "avi", codec: "mjpeg", reordered: 0, times: times.clone(), sound: 0, muxing: &[] }.write(&path);
+    let mut bytes = fs::read(&path).unwrap();
+    for (chunk, offset) in [(b"avih", 8 + 16), (b"strh", 8 + 32)] {
+        let at = bytes.windows(4).position(|window| window == chunk).unwrap() + offset;
+        bytes[at] += 1;
+    }
+    fs::write(&path, bytes).unwrap();
+    assert_times("one more in the header", &path, &times);
+}
+
+#[test]
+fn frames_before_the_start_of_an_edit_are_not_shown() {
+    let dir = tempfile::tempdir().unwrap();
+    let path = dir.path().join("film");
+    let times: Vec<i64> = (-8..32).map(|i| 40 * i).collect();
+    // The writer keeps them in the file and skips them with an edit list.
+    let muxing = [("avoid_negative_ts", "disabled")];
+    Film { container: "mp4", codec: "mpeg4", reordered: 2, times, sound: 0, muxing: &muxing }.write(&path);
+    assert_times("edit list", &path, &(0..32).map(|i| 40 * i).collect::<Vec<_>>());
+}
+
+#[test]
+fn a_film_of_a_turned_camera_is_upright() {
+    let dir = tempfile::tempdir().unwrap();
+    let path = dir.path().join("film");
+    Film { container: "mp4", codec: "mpeg4", reordered: 0, times: vec![0, 40], sound: 0, muxing: &[] }.write(&path);
+    let bytes = fs::read(&path).unwrap();
+    let at = bytes.windows(4).position(|window| window == b"tkhd").unwrap() + 4 + 40;
+    // The bright half lies on the left of the stored image. Columns: a, b, c, d of the matrix, and where it is then.
+    for (matrix, is_turned, bright) in [
+        ([1, 0, 0, 1], false, (0, 24)),
+        ([-1, 0, 0, -1], false, (63, 24)),
+        ([-1, 0, 0, 1], false, (63, 24)),
+        ([0, 1, -1, 0], true, (24, 0)),
+        ([0, -1, 1, 0], true, (24, 63)),
+    ] {
+        let mut turned = bytes.clone();
+        for (place, value) in [0, 1, 3, 4].into_iter().zip(matrix) {
+            turned[at + 4 * place..at + 4 * place + 4].copy_from_slice(&(65_536i32 * value).to_be_bytes());
+        }
+        fs::write(&path, turned).unwrap();
+        let mut video = VideoReplay::open(&"a".into(), &path, &VideoOptions::default()).unwrap();
+        let size = if is_turned { (48, 64) } else { (64, 48) };
+        assert_eq!(video.image_size(), Some(size), "{matrix:?}");
+        let image = video.next_frame(Duration::ZERO).unwrap().image;
+        assert_eq!((image.width(), image.height()), size, "{matrix:?}");
+        let level = |(x, y): (u32, u32)| image.bytes()[3 * (y * size.0 + x) as usize];
+        let opposite = (size.0 - 1 - bright.0, size.1 - 1 - bright.1);
+        assert!(level(bright) > level(opposite), "{matrix:?}: {} {}", level(bright), level(opposite));
+    }
+}
+
+#[test]
+fn a_file_that_is_cut_is_reported_once_behind_its_whole_frames() {
+    let dir = tempfile::tempdir().unwrap();
+    let path = dir.path().join("film");
+    for (container, codec, muxing) in [
+        ("mp4", "mpeg4", &[("movflags", "faststart")][..]),
+        ("mp4", "mpeg4", &[("movflags", "frag_keyframe+empty_moov")]),
+        ("matroska", "mpeg4", &[]),
+        ("avi", "mjpeg", &[]),
+    ] {
+        Film { container, codec, reordered: 0, times: variable(), sound: 0, muxing }.write(&path);
+        let whole = fs::read(&path).unwrap();
+        fs::write(&path, &whole[..whole.len() * 4 / 5]).unwrap();
+        let (times, lumas, errors) = read(&path);
+        assert!((8..=40).contains(&times.len()), "{container}: {} frames", times.len());
+        assert!(lumas.is_sorted_by(|a, b| a < b), "{container}: {lumas:?}");
+        let [error] = &errors[..] else { panic!("{container}: {errors:?}") };
+        assert!(error.contains("; the file is cut off or damaged"), "{container}: {error}");
+        assert!(error.contains(&format!("ends after {} frames", times.len())), "{container}: {error}");
+    }
+}
