@@ -319,6 +319,7 @@ fn the_field_of_view_of_qualisys_is_heeded_and_its_other_keys_named() {
         ("skew=\"0\"", "skew=\"0\" lensModel=\"fisheye\"", "\"lensModel\" is not understood"),
         ("focalLengthU=\"64000\"", "focalLengthU=\"nan\"", "focalLengthU is missing or no number"),
         ("<transform", "<fisheye_lens/><transform", "\"fisheye_lens\" is not understood"),
+        ("type=\"regular\"", "units=\"m\"", "\"units\" is not understood"),
     ] {
         assert!(QUALISYS.contains(from), "{from}");
         refused(Format::Qualisys, "a.qca.txt", &QUALISYS.replace(from, to), &["camera 26580", word]);

@@ -66,7 +66,9 @@ pub fn shorten_values(text: &str) -> Cow<'_, str> {
         rest = &after[end + 1..];
     }
     short.push_str(rest);
-    let is_long = |word: &str| word.chars().nth(MAX_VALUE).is_some() && !word.contains('/') && !word.contains(":\\");
+    // A cut value has its quotes and a comma.
+    let most = MAX_VALUE + 4;
+    let is_long = |word: &str| word.chars().nth(most).is_some() && !word.contains('/') && !word.contains(":\\");
     let words = short.split_inclusive(char::is_whitespace).map(|word| match word.trim_end() {
         long if is_long(long) => shortened(long) + &word[long.len()..],
         _ => Cow::Borrowed(word),
@@ -118,7 +120,7 @@ fn escape(text: &str, most: usize) -> Cow<'_, str> {
     Cow::Owned(shown)
 }
 
-/// Returns whether a terminal would obey a character, or show nothing in its place.
+/// Returns whether a terminal would obey a character instead of showing it.
 pub(crate) fn is_obeyed(char: char) -> bool {
     char.is_control()
         || matches!(char, '\u{61c}' | '\u{200e}' | '\u{200f}' | '\u{2028}'..='\u{202e}' | '\u{2066}'..='\u{2069}')

@@ -62,7 +62,7 @@ fn camera(id: &str, node: Node<'_, '_>) -> Result<ImportedCamera, String> {
     let (intrinsic, transform) = (child("intrinsic")?, child("transform")?);
     let elements = node.children().filter(Node::is_element);
     refuse_unknown(elements.map(|element| element.tag_name().name()), &ELEMENTS)?;
-    for element in [node, intrinsic, transform] {
+    for element in node.ancestors().filter(Node::is_element).chain([intrinsic, transform]) {
         refuse_unknown(element.attributes().map(|attribute| attribute.name()), &KEYS)?;
     }
     if node.attribute("calibrated").is_some_and(|flag| !matches!(flag, "true" | "True" | "1")) {

@@ -127,3 +127,48 @@ const STANDARD: [[u8; 64]; 2] = [[
     99, 99, 99, 99, 99, 99, 99, 99, 99, 99, 99, 99, 99, 99, 99, 99, 99, 99, 99, 99, 99, 99, 99, 99, 99, 99, 99, 99, 99, 99,
     99, 99, 99, 99,
 ]];
+
+#[cfg(test)]
+mod tests {
+    use super::super::{segments, testing::encoded};
+    use super::*;
+
+    fn check(guard: &mut Guard, bytes: &[u8]) -> Result<(), Damage> {
+        guard.check(bytes, segments(bytes))
+    }
+
+    #[test]
+    fn a_camera_that_always_adds_bytes_is_used_after_a_while() {
+        let odd = |shift| {
+            let bytes = encoded(96, 64, 0, shift);
+            [&bytes[..bytes.len() - 2], &[0, 1, 0xff, 0xd9]].concat()
+        };
+        let mut guard = Guard::default();
+        let used: Vec<bool> = (0..20).map(|i| check(&mut guard, &odd(i)).is_ok()).collect();
+        assert_eq!(used.iter().position(|is_used| *is_used), Some(7));
+        assert!(used[7..].iter().all(|is_used| *is_used));
+        // One now and then is damage.
+        let mut guard = Guard::default();
+        for i in 0..200 {
+            let is_odd = i % 10 == 9;
+            let bytes = if is_odd { odd(i) } else { encoded(96, 64, 0, i) };
+            assert_eq!(check(&mut guard, &bytes).is_err(), is_odd, "{i}");
+        }
+    }
+
+    #[test]
+    fn tables_that_change_in_one_entry_are_refused_unless_they_stay() {
+        let bytes = encoded(96, 64, 0, 0);
+        let at = segments(&bytes).find(|(_, marker)| *marker == 0xdb).unwrap().0 + 5 + 20;
+        let mut other = bytes.clone();
+        other[at] ^= 0x10;
+        let mut guard = Guard::default();
+        assert_eq!(check(&mut guard, &other), Err(Damage::Tables), "like a standard table");
+        let mut guard = Guard::default();
+        assert_eq!(check(&mut guard, &bytes), Ok(()));
+        assert_eq!(check(&mut guard, &other), Err(Damage::Tables));
+        assert_eq!(check(&mut guard, &bytes), Ok(()));
+        assert_eq!(check(&mut guard, &other), Err(Damage::Tables));
+        assert_eq!(check(&mut guard, &other), Ok(()), "twice in a row");
+    }
+}

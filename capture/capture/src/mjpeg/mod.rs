@@ -3,6 +3,8 @@
 mod guard;
 mod scan;
 mod shifts;
+#[cfg(test)]
+mod testing;
 
 use zune_jpeg::{
     JpegDecoder,

@@ -499,3 +499,99 @@ pub(crate) fn walk(bytes: &[u8], segments: impl Iterator<Item = (usize, u8)>) ->
     scan.tables = header.tables;
     Ok(Some(scan))
 }
+
+#[cfg(test)]
+mod tests {
+    use super::super::{segments, testing::encoded};
+    use super::*;
+
+    fn walked(bytes: &[u8]) -> Result<Scan, Fault> {
+        walk(bytes, segments(bytes)).map(|scan| scan.expect("sequential"))
+    }
+
+    /// Replaces the end marker.
+    fn ending(bytes: &[u8], end: &[u8]) -> Vec<u8> {
+        [&bytes[..bytes.len() - 2], end].concat()
+    }
+
+    #[test]
+    fn means_of_blocks_and_rows_are_those_of_the_decoded_image() {
+        let grey = image::GrayImage::from_fn(40, 24, |x, y| image::Luma([(x * 3 + y * y / 4) as u8]));
+        let mut bytes = std::io::Cursor::new(Vec::new());
+        grey.write_to(&mut bytes, image::ImageFormat::Jpeg).unwrap();
+        let decoded = image::load_from_memory(bytes.get_ref()).unwrap().into_luma8();
+        let scan = walked(bytes.get_ref()).unwrap();
+        let plane = &scan.planes[0];
+        assert_eq!((plane.width, plane.height, plane.blocks.len()), (5, 3, 15));
+        for (i, block) in plane.blocks.iter().enumerate() {
+            let row = |y: usize| {
+                let values = (0..8).map(|x| decoded.get_pixel((i % 5 * 8 + x) as u32, (i / 5 * 8 + y) as u32).0[0]);
+                values.map(f32::from).sum::<f32>() / 8.0 - 128.0
+            };
+            let mean = (0..8).map(row).sum::<f32>() / 8.0;
+            for (found, expected) in [
+                (block.mean, mean),
+                (block.top[0], row(0)),
+                (block.top[1], row(1)),
+                (block.bottom[0], row(7)),
+                (block.bottom[1], row(6)),
+            ] {
+                assert!((found - expected).abs() < 0.6, "block {i}: {found} for {expected}");
+            }
+        }
+    }
+
+    #[test]
+    fn surplus_bytes_and_cut_data_are_faults() {
+        for interval in [0, 3] {
+            let bytes = encoded(96, 64, interval, 0);
+            let whole = walked(&bytes).unwrap();
+            assert_eq!((whole.oddity, whole.restart_interval, whole.planes.len()), (None, interval as usize, 3));
+            assert_eq!(walked(&ending(&bytes, &[0xff, 0xff, 0xd9])).unwrap(), whole, "fill bytes");
+            assert_eq!(walked(&ending(&bytes, &[1, 2, 0xff, 0xd9])).unwrap().oddity, Some(Fault::Surplus));
+            assert_eq!(walked(&ending(&bytes, &[7; 9])), Err(Fault::Surplus));
+            assert_eq!(walked(&ending(&bytes, &[0xff, 0xd0])), Err(Fault::Marker));
+            let start = segments(&bytes).last().unwrap().0 + 14;
+            for cut in [start + 40, (start + bytes.len()) / 2, bytes.len() - 20] {
+                let fault = walked(&[&bytes[..cut], &[0xff, 0xd9]].concat()).unwrap_err();
+                assert!([Fault::Early, Fault::Marker, Fault::Coefficient, Fault::Code].contains(&fault), "{fault}");
+            }
+        }
+    }
+
+    #[test]
+    fn restart_markers_come_in_order() {
+        let bytes = encoded(96, 64, 3, 0);
+        let place = |marker: u8| bytes.windows(2).position(|pair| pair == [0xff, marker]).unwrap();
+        let mut swapped = bytes.clone();
+        swapped[place(0xd0) + 1] = 0xd1;
+        assert_eq!(walked(&swapped), Err(Fault::Marker));
+        // A whole section is lost.
+        let mut short = bytes.clone();
+        short.drain(place(0xd0)..place(0xd1));
+        assert_eq!(walked(&short), Err(Fault::Marker));
+    }
+
+    #[test]
+    fn any_bytes_come_to_an_end() {
+        let mut state = 5u64;
+        let mut random = |n: usize| {
+            state = state.wrapping_mul(6_364_136_223_846_793_005).wrapping_add(1_442_695_040_888_963_407);
+            (state >> 33) as usize % n.max(1)
+        };
+        for interval in [0, 3] {
+            let bytes = encoded(96, 64, interval, 0);
+            for round in 0..3000 {
+                let mut found = bytes.clone();
+                // Half of them in the header, whose sizes, tables and numbers are the dangerous part.
+                let most = if round % 2 == 0 { 640 } else { bytes.len() };
+                for _ in 0..1 + random(6) {
+                    let at = 2 + random(most - 2);
+                    found[at] = random(256) as u8;
+                }
+                found.truncate(if round % 5 == 0 { random(found.len()) } else { usize::MAX });
+                let _ = walk(&found, segments(&found));
+            }
+        }
+    }
+}

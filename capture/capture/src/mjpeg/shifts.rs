@@ -129,8 +129,19 @@ fn follows_a_row(width: usize, counts: &[u32], has_before: bool) -> bool {
         inside.is_some_and(|share| share >= SHARE) && beside.is_some_and(|share| share <= BESIDE)
     };
     let half = 16.max(width / 2);
+    let in_row = |row: Option<usize>| {
+        row.filter(|row| *row < rows).map(|row| (counts[(row + 1) * width] - counts[row * width]) as f32)
+    };
     (0..=rows).any(|next| {
         let row = next.checked_sub(1);
+        // Most rows have too few at all.
+        let is_possible = match (in_row(row), in_row(Some(next))) {
+            (Some(upper), Some(lower)) => upper + lower >= SHARE * width as f32,
+            (upper, lower) => upper.or(lower).is_some_and(|count| has_before && count >= SHARE * half as f32),
+        };
+        if !is_possible {
+            return false;
+        }
         (SHORTEST..=width.saturating_sub(SHORTEST)).any(|column| {
             let right = share(row, column, width);
             let left = share(Some(next), 0, column);
@@ -151,6 +162,9 @@ fn follows_a_row(width: usize, counts: &[u32], has_before: bool) -> bool {
 fn is_changed_from_a_place_on(now: &Levels, before: &Levels) -> bool {
     let changes: Vec<f32> = now.means.iter().zip(&before.means).map(|(now, before)| now - before).collect();
     let (mut counts, mut jumps) = (Vec::with_capacity(changes.len() + 1), Vec::new());
+    let mut sorted = changes.clone();
+    sorted.sort_unstable_by(f32::total_cmp);
+    let below = |value: f32| sorted.partition_point(|change| *change < value);
     // Anywhere in a row, or by precisely one value and with a sharp edge at its ends as well: a light that was switched on
     // between two rows changes each thing by a value of its own.
     let wide = [2.0f32, 4.0, 8.0, 16.0, 32.0, 64.0].into_iter().map(|least| (least, 2.5 * least, false));
@@ -159,17 +173,20 @@ fn is_changed_from_a_place_on(now: &Levels, before: &Levels) -> bool {
     let narrow = narrow.map(|value| (0.9 * value - 0.7, 1.1 * value + 0.7, true));
     wide.chain(narrow).any(|(least, most, is_narrow)| {
         [1.0, -1.0].iter().any(|sign| {
+            // Without most of a row behind the place and of a quarter before it, there is none.
+            let changed = if *sign > 0.0 { below(most) - below(least) } else { below(-least) - below(-most) };
+            let unchanged = below(least / 2.0) - below(-least / 2.0);
+            if (changed as f32) < SHARE * now.across as f32 || (unchanged as f32) < SHARE * (now.across / 4) as f32 {
+                return false;
+            }
             // MCUs before each one that changed so, and that did not change.
             let mut sums = [0u32; 2];
             counts.clear();
             counts.push(sums);
             for change in changes.iter().map(|change| sign * change) {
-                sums[0] += u32::from((least..most).contains(&change));
-                sums[1] += u32::from(change.abs() < least / 2.0);
+                sums[0] += u32::from((least..=most).contains(&change));
+                sums[1] += u32::from(change.abs() <= least / 2.0);
                 counts.push(sums);
-            }
-            if 2 * (sums[0] as usize) < now.across {
-                return false;
             }
             // Upper edges before each one that jump by at least half of it.
             jumps.clear();
@@ -214,4 +231,89 @@ fn is_split(now: &Levels, counts: &[[u32; 2]], jumps: &[u32]) -> bool {
             && most(1, start, place)
             && most(0, end, end + column)
     })
+}
+
+#[cfg(test)]
+mod tests {
+    use super::super::scan::BlockMeans;
+    use super::*;
+
+    /// Size in MCUs of 2 by 2 blocks.
+    const ACROSS: usize = 20;
+    const DOWN: usize = 16;
+
+    /// Levels of an image of which each row has these levels, `noise` aside, and `added` by MCU in the order of the file.
+    fn levels(seed: u64, row: impl Fn(usize, f32) -> f32, added: impl Fn(usize) -> f32) -> ImageLevels {
+        let mut state = seed;
+        let mut noise = || {
+            state = state.wrapping_mul(6_364_136_223_846_793_005).wrapping_add(1_442_695_040_888_963_407);
+            (state >> 40) as f32 / (1u64 << 24) as f32 - 0.5
+        };
+        let (width, height) = (2 * ACROSS, 2 * DOWN);
+        let blocks = (0..width * height).map(|i| {
+            let (column, line) = (i % width, i / width);
+            let shift = added(line / 2 * ACROSS + column / 2) + 1.5 * noise();
+            let at = |y: f32| row(column, line as f32 + y / 8.0) + shift;
+            BlockMeans { mean: at(3.5), top: [at(0.0), at(1.0)], bottom: [at(7.0), at(6.0)] }
+        });
+        let plane = Plane { width, height, step: [2, 2], blocks: blocks.collect() };
+        ImageLevels::new(&Scan { planes: vec![plane], ..Scan::default() })
+    }
+
+    /// A wall, a floor, and a table's straight edge on half of the width.
+    fn room(column: usize, line: f32) -> f32 {
+        let floor = if line >= 20.0 { -60.0 } else { 40.0 };
+        floor + if column < 20 && (8.0..12.0).contains(&line) { -70.0 } else { 0.0 } + 2.0 * line
+    }
+
+    #[test]
+    fn a_shift_from_a_place_on_is_found() {
+        let before = levels(1, room, |_| 0.0);
+        for (shift, first) in [(6.0, 30), (-6.0, 130), (12.0, 212), (-40.0, 90), (25.0, 277), (-9.0, 60), (15.0, 59)] {
+            let now = levels(2, room, |mcu| if mcu >= first { shift } else { 0.0 });
+            assert!(now.are_shifted(Some(&before)), "{shift} from {first} on");
+        }
+        // Without an image before, only a shift that begins inside of a row.
+        for first in [30, 150, 252] {
+            let now = levels(2, room, |mcu| if mcu >= first { 12.0 } else { 0.0 });
+            assert!(now.are_shifted(None), "from {first} on");
+        }
+    }
+
+    #[test]
+    fn scenes_and_lights_are_no_shift() {
+        let before = levels(1, room, |_| 0.0);
+        let dark = levels(1, |column, line| 0.2 * room(column, line), |_| 0.0);
+        let row = |mcu: usize| mcu / ACROSS;
+        let cases: [(&str, ImageLevels); 6] = [
+            ("nothing", levels(3, room, |_| 0.0)),
+            ("light", levels(3, |column, line| 1.5 * room(column, line) + 20.0, |_| 0.0)),
+            (
+                "a person",
+                levels(3, room, |mcu| if (6..11).contains(&(mcu % ACROSS)) && row(mcu) > 3 { -50.0 } else { 0.0 }),
+            ),
+            ("another scene", levels(9, |column, line| (column as f32 * 3.0 - line * 4.0).sin() * 60.0, |_| 0.0)),
+            (
+                "a flash of some rows",
+                levels(3, |c, l| room(c, l) + if l >= 17.3 { 0.4 * (room(c, l) + 128.0) } else { 0.0 }, |_| 0.0),
+            ),
+            ("all brighter", levels(3, room, |_| 9.0)),
+        ];
+        for (name, now) in cases {
+            assert!(!now.are_shifted(Some(&before)), "{name}");
+            assert!(!now.are_shifted(Some(&dark)), "{name}, from the dark");
+            assert!(!now.are_shifted(None), "{name}, first");
+        }
+    }
+
+    #[test]
+    fn empty_and_tiny_images_are_no_shift() {
+        for size in [0, 1, 2, 3] {
+            let blocks = vec![BlockMeans { mean: f32::NAN, ..BlockMeans::default() }; size * size];
+            let plane = Plane { width: size, height: size, step: [1, 1], blocks };
+            let levels = ImageLevels::new(&Scan { planes: vec![plane], ..Scan::default() });
+            assert!(!levels.are_shifted(None));
+            assert!(!levels.are_shifted(Some(&levels)));
+        }
+    }
 }

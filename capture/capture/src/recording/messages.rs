@@ -86,6 +86,14 @@ impl Iterator for Messages {
     }
 }
 
+/// Returns the text of an error, with the system's own, which the text of the mcap crate omits.
+pub(super) fn cause(error: &McapError) -> String {
+    match error {
+        McapError::Io(error) => error.to_string(),
+        other => other.to_string(),
+    }
+}
+
 /// File whose chunks must not expand beyond all measure.
 struct Watched {
     file: File,

@@ -4,7 +4,11 @@ use std::path::{Path, PathBuf};
 
 use mcap::{McapResult, Message};
 
-use super::{disk::part_path, messages::Messages, part::Link};
+use super::{
+    disk::part_path,
+    messages::{Messages, cause},
+    part::Link,
+};
 use crate::error::{CaptureError, CaptureErrorKind};
 
 /// Messages of a file and, when it is the first of a rotated recording, of the files after it.
@@ -74,7 +78,7 @@ impl Iterator for Parts {
                 return end;
             }
             if let Some(Err(error)) = end {
-                tracing::warn!("{} breaks off: {error}; going on", part_path(&self.first, part).display());
+                tracing::warn!("{} breaks off: {}; going on", part_path(&self.first, part).display(), cause(&error));
             }
         }
     }

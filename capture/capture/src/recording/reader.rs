@@ -9,6 +9,7 @@ use flyrig_types::{CameraId, Frame, shortened};
 
 use super::{
     message::{self, TOPIC},
+    messages::cause,
     parts::Parts,
     schemas::Schema,
 };
@@ -115,7 +116,7 @@ pub(super) fn not_readable(path: &Path, error: &mcap::McapError) -> CaptureError
         mcap::McapError::BadMagic if is(b"#ROSBAG") || is(b"SQLite format") => {
             "it is a bag of ROS in another format; convert it with `mcap convert`".to_owned()
         }
-        error => shortened(&error.to_string()).into_owned(),
+        error => shortened(&cause(error)).into_owned(),
     };
     CaptureError::general(CaptureErrorKind::Corrupt, format!("{} is no recording: {text}", path.display()))
 }
@@ -241,7 +242,7 @@ impl CameraSource for McapReplay {
             let message = match self.messages.next() {
                 Some(Ok(message)) => message,
                 Some(Err(error)) => {
-                    tracing::warn!("camera {}: {} breaks off: {error}", self.camera.id, self.path.display());
+                    tracing::warn!("camera {}: {} breaks off: {}", self.camera.id, self.path.display(), cause(&error));
                     return Err(self.end());
                 }
                 None => break,

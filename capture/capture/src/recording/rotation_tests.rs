@@ -361,8 +361,8 @@ fn a_recording_goes_on_in_a_new_file_once_the_disk_has_space_again() {
             passed += pass_until(&recorder, &mut tap, |state| state.paused.is_some());
             let full = recorder.state();
             assert_eq!(full.problem, None, "it waits");
-            memory.with(|files| files.files.iter().for_each(|file| drop(summary(file))));
             passed += pass_until(&recorder, &mut tap, |state| state.dropped > full.dropped + 5);
+            memory.with(|files| files.files.iter().for_each(|file| drop(summary(file))));
             assert_eq!(recorder.state().files, full.files, "nothing is written to the full disk");
             memory.with(|files| files.free = Some(GIB));
             passed += pass_until(&recorder, &mut tap, |state| state.frames > full.frames);

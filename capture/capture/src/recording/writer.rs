@@ -18,6 +18,7 @@ use mcap::{McapError, McapResult};
 use super::{
     compress::Compression,
     disk::{Disk, Folder},
+    messages::cause,
     outlet::{Item, Note, Outlet, OutletState, Recorded, WAITING_FRAMES},
     part::{Link, RecordingPart},
     rotation::Rotation,
@@ -90,7 +91,7 @@ impl Recorder {
         if config.rotation.is_on() && second.exists() {
             return Err(io(&format!("{} is there already; name another file", second.display())));
         }
-        Self::start(folder, notes, config).map_err(|error| io(&cause(error)))
+        Self::start(folder, notes, config).map_err(|error| io(&cause(&error)))
     }
 
     pub(super) fn start<D: Disk>(mut disk: D, notes: &[Note], config: &RecorderConfig) -> McapResult<Self> {
@@ -129,7 +130,7 @@ impl Recorder {
                 Ok(Ok(())) => {}
                 Ok(Err(error)) => {
                     let advice = if is_full(&error) { "free space on the disk and record" } else { "record" };
-                    of_thread.stop(format!("{}; {advice} into a new file", cause(error)));
+                    of_thread.stop(format!("{}; {advice} into a new file", cause(&error)));
                 }
                 Err(text) => of_thread.stop(format!("writing failed inside: {text}; record into a new file")),
             }
@@ -196,14 +197,6 @@ impl Drop for Recorder {
 
 fn is_full(error: &McapError) -> bool {
     matches!(error, McapError::Io(error) if error.kind() == io::ErrorKind::StorageFull)
-}
-
-/// Extracts the system's error, which the text of the mcap crate omits.
-fn cause(error: McapError) -> String {
-    match error {
-        McapError::Io(error) => error.to_string(),
-        other => other.to_string(),
-    }
 }
 
 /// Describes the missing space when less than the reserve is free.

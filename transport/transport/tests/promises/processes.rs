@@ -250,6 +250,6 @@ fn a_viewer_that_is_stopped_for_a_minute_costs_the_others_neither_latency_nor_me
     println!("one stopped, 12 to 60 s: {count} images, median {median:.2} ms, p99 {later:.2} ms, {later_mb:.1} MB");
     watcher.signal("-CONT");
     assert!(stopped_mb.max(later_mb) <= before_mb + 50.0, "{before_mb} MB, then {stopped_mb} and {later_mb}");
-    // Other programs of a busy machine add to any of these; a publisher that waits for the viewer would add seconds.
-    assert!(stalled.max(later) <= 1.05 * before + 5.0, "{before} ms, then {stalled} and {later}");
+    // Other programs of a busy machine add a millisecond to any of these; a publisher that waited for the viewer would add fifty.
+    assert!(stalled.max(later) <= 1.05 * before + 1.0, "{before} ms, then {stalled} and {later}");
 }

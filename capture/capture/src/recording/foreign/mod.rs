@@ -22,6 +22,7 @@ use self::{
 };
 use super::{
     message,
+    messages::cause,
     parts::Parts,
     reader::{FrameTimes, RecordedCamera, not_readable},
     schemas::{Kind, LensMessage, Schema},
@@ -125,7 +126,7 @@ impl Scan {
                 Ok(message) => scan.add(message),
                 Err(error) if is_empty => return Err(not_readable(path, &error)),
                 Err(error) => {
-                    tracing::warn!("{} breaks off: {error}", path.display());
+                    tracing::warn!("{} breaks off: {}", path.display(), cause(&error));
                     break;
                 }
             }
