@@ -26,7 +26,7 @@ const PATIENCE: Duration = Duration::from_secs(1);
 const LONGEST: Duration = Duration::from_secs(2);
 /// Largest request, bytes; the smallest bound that hyper takes.
 const REQUEST_BYTES: usize = 8192;
-/// Largest number of clients at a time; further ones wait in the system's queue.
+/// Largest number of clients at a time; further ones take the place of the oldest.
 const CONNECTIONS: usize = 32;
 
 /// Server that answers HTTP requests with the text published last, in one thread.

@@ -1,8 +1,9 @@
 //! Images that viewers get before they have waited for them.
 //!
-//! A viewpoint earns its images: each is due once the pixels of one image have passed at the granted rate. The first image alone may come at
-//! once, for each holder of a key once within [`PERIOD`]; viewers without keys count as one holder, since nothing but a name of their own
-//! choice tells them apart. So a viewer gains nothing by giving its viewpoint back and asking again, under whatever name.
+//! A viewpoint earns its images from its grant on: each is due once the pixels of one image have passed at the granted rate. The first
+//! image alone may come at once, for each holder of a key once within [`PERIOD`]; viewers without keys count as one holder, since nothing
+//! but a name of their own choice tells them apart. So a viewer gains nothing by giving its viewpoint back and asking again, under
+//! whatever name.
 
 use std::{
     collections::VecDeque,

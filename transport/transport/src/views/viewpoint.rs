@@ -118,42 +118,53 @@ pub(crate) fn check_camera(topic: &str, camera: &Camera, max_fps: f64) -> Result
 struct Lease {
     viewpoint: Viewpoint,
     ends: Instant,
-    /// Time at which the next image is due; `None` before the viewpoint is watched.
-    next_due: Option<Instant>,
+    /// Time at which the next image is due.
+    next_due: Instant,
+    /// Whether no frame set has come since it is watched.
+    is_new: bool,
 }
 
 impl Lease {
+    fn new(viewpoint: Viewpoint, ends: Instant, now: Instant) -> Self {
+        let period = period(&viewpoint);
+        // Not one that may be a little early, see below: it would pay to give the viewpoint back after every image.
+        Self { viewpoint, ends, next_due: now + period + period / 8, is_new: true }
+    }
+
     /// Replaces viewpoint and end. Pixels that were earned towards the next image stay earned at another size or rate.
     fn renew(&mut self, viewpoint: Viewpoint, ends: Instant, now: Instant) {
         let before = std::mem::replace(&mut self.viewpoint, viewpoint);
         self.ends = ends;
         let is_same = [pixels, pixel_rate].map(|of| of(&before).total_cmp(&of(&self.viewpoint)).is_eq()) == [true; 2];
-        if let Some(due) = self.next_due.filter(|_| !is_same) {
-            let missing = due.saturating_duration_since(now).as_secs_f64() * pixel_rate(&before);
+        if !is_same {
+            let missing = self.next_due.saturating_duration_since(now).as_secs_f64() * pixel_rate(&before);
             let earned = (pixels(&before) - missing).max(0.0);
             let missing = (pixels(&self.viewpoint) - earned).max(0.0);
-            self.next_due = now.checked_add(saturating_secs(missing / pixel_rate(&self.viewpoint)));
+            self.next_due = now + saturating_secs(missing / pixel_rate(&self.viewpoint));
         }
     }
 
     /// Returns whether an image is due, and schedules the next one a period later.
     fn take_due(&mut self, first_images: &mut FirstImages, now: Instant) -> bool {
-        let period = saturating_secs(1.0 / self.viewpoint.max_fps);
-        let Some(due) = self.next_due else {
-            let is_first = first_images.take(&self.viewpoint.subscriber, now);
-            // One that waits does so for a whole period, not for one that may be a little early.
-            self.next_due = now.checked_add(if is_first { period } else { period + period / 8 });
-            return is_first;
-        };
+        let period = period(&self.viewpoint);
+        if std::mem::take(&mut self.is_new) && first_images.take(&self.viewpoint.subscriber, now) {
+            self.next_due = now + period;
+            return true;
+        }
         // A frame set of the same rate that is a little early must not lose its image.
-        if now + period / 8 < due {
+        if now + period / 8 < self.next_due {
             return false;
         }
         // Periods add up, so that jitter does not change the mean rate. After a pause, at most half a period is made up for.
         let earliest = now.checked_sub(period / 2).unwrap_or(now);
-        self.next_due = due.checked_add(period).map(|next| next.max(earliest));
+        self.next_due = (self.next_due + period).max(earliest);
         true
     }
+}
+
+/// Returns the time from one image to the next.
+fn period(viewpoint: &Viewpoint) -> Duration {
+    saturating_secs(1.0 / viewpoint.max_fps)
 }
 
 /// Request that could not be drawn.
@@ -260,7 +271,7 @@ impl Leases {
                 format!("all {max} viewpoints of the rig are taken; wait for one or raise max_viewers"),
             ));
         }
-        self.active.push(Lease { viewpoint, ends, next_due: None });
+        self.active.push(Lease::new(viewpoint, ends, now));
         self.granted += 1;
         Ok(())
     }
