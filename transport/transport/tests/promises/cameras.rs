@@ -175,19 +175,6 @@ fn rigs_of_one_network_do_not_mix_and_a_wrong_name_is_told() {
     assert!(of_three.next_frame(&"a".into(), Duration::ZERO).unwrap().is_none());
 }
 
-/// Returns the name in topics of the only computer whose name begins so, from a program of the rig's computer.
-pub fn spy_on_host(endpoint: &str, start: &str) -> String {
-    let session = stranger(&[endpoint.to_owned()]);
-    wait_for("the computer's name", || {
-        let found = session.liveliness().get("flyrig/v1/test/host/*").wait().unwrap();
-        let mut names = found.iter().filter_map(|reply| {
-            let name = reply.result().ok()?.key_expr().as_str().rsplit('/').next()?.to_owned();
-            name.starts_with(start).then_some(name)
-        });
-        names.next()
-    })
-}
-
 /// Returns the publisher of this name, as headers state it.
 pub fn publisher_of(name: &str) -> u64 {
     name.bytes().fold(0xcbf2_9ce4_8422_2325, |hash, b| (hash ^ u64::from(b)).wrapping_mul(0x0100_0000_01b3))
