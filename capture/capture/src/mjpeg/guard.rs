@@ -33,8 +33,10 @@ const HABIT: u32 = 8 * ODD;
 /// Examiner of the images of one camera.
 #[derive(Debug, Clone, Default)]
 pub(crate) struct Guard {
-    /// Levels of the last image that was used, and of the last that was refused for them.
-    used: Option<ImageLevels>,
+    /// Levels of the last two images that were used, the newer one first: a slight shift in one of them may have been
+    /// missed.
+    used: [Option<ImageLevels>; 2],
+    /// Levels of the last image that was refused for them.
     shifted: Option<ImageLevels>,
     /// Tables of the last image that was used, and of the last that was refused for them.
     tables: Option<Tables>,
@@ -57,14 +59,15 @@ impl Guard {
         // A restart marker ends a shift.
         let rows = scan.planes.first().map_or(1, |plane| plane.width / plane.step[0].max(1));
         let is_restarted = (1..=2 * rows).contains(&scan.restart_interval);
-        if !is_restarted
-            && levels.are_shifted(self.used.as_ref())
-            && self.shifted.as_ref().is_none_or(|shifted| levels.are_shifted(Some(shifted)))
+        let [newer, older] = &self.used;
+        let is_shifted_too = |other: &Option<ImageLevels>| other.as_ref().is_none_or(|o| levels.are_shifted(Some(o)));
+        if !is_restarted && levels.are_shifted(newer.as_ref()) && is_shifted_too(older) && is_shifted_too(&self.shifted)
         {
             self.shifted = Some(levels);
             return Err(Damage::Shift);
         }
-        (self.used, self.shifted) = (Some(levels), None);
+        self.used.swap(0, 1);
+        (self.used[0], self.shifted) = (Some(levels), None);
         Ok(())
     }
 

@@ -95,7 +95,7 @@ fn has_stretch(now: &Levels, before: Option<&Levels>) -> bool {
     let largest = now.jumps.iter().fold(0f32, |most, jump| most.max(jump.abs()));
     // Jumps of this kind before each edge.
     let mut counts = Vec::with_capacity(now.jumps.len() + 1);
-    let mut least = 2.5;
+    let mut least = 3.0;
     while least <= largest {
         for sign in [1.0, -1.0] {
             let is_such = |jump: f32| sign * jump >= least;
@@ -168,7 +168,7 @@ fn is_changed_from_a_place_on(now: &Levels, before: &Levels) -> bool {
     // Anywhere in a row, or by precisely one value and with a sharp edge at its ends as well: a light that was switched on
     // between two rows changes each thing by a value of its own.
     let wide = [2.0f32, 4.0, 8.0, 16.0, 32.0, 64.0].into_iter().map(|least| (least, 2.5 * least, false));
-    let narrow = (3u8..=200).map(f32::from).map(|value| (value - 1.5, value + 1.5, true));
+    let narrow = (5u8..=200).map(f32::from).map(|value| (value - 1.5, value + 1.5, true));
     wide.chain(narrow).any(|(least, most, is_narrow)| {
         [1.0, -1.0].iter().any(|sign| {
             // Without most of a row behind the place and of a quarter before it, there is none.
