@@ -9,7 +9,7 @@ use flyrig_types::{CameraId, Intrinsics};
 
 use super::{
     output::refuse_existing,
-    views::{BoardTakeArgs, SeenBoards},
+    views::{BoardTakeArgs, SeenBoards, load_board},
 };
 use crate::arguments::{BoardArgs, TargetArgs};
 
@@ -30,7 +30,7 @@ const GOOD_COVERAGE: f64 = 0.6;
 /// Runs the command.
 pub fn lens(args: &CalibrateLensArgs, gpu: &dyn Fn() -> Result<GpuContext>) -> Result<()> {
     stop::flag();
-    let board = Board::load(&args.board.board)?;
+    let board = load_board(&args.board.board, &args.take)?;
     refuse_existing(&args.target.out, &["calibration.toml"], args.target.force)?;
     let seen = SeenBoards::find(&args.take, &board, gpu)?;
     let lenses = solve(&board, &seen)?;

@@ -15,7 +15,7 @@ use super::{
     lens,
     output::{FILES, refuse_existing},
     page,
-    views::{BoardTakeArgs, SeenBoards},
+    views::{BoardTakeArgs, SeenBoards, load_board},
 };
 use crate::arguments::{SolveArgs, TargetArgs};
 
@@ -57,7 +57,7 @@ pub(super) struct RigTarget<'a> {
 /// Runs the command.
 pub fn rig(args: &CalibrateRigArgs, gpu: &dyn Fn() -> Result<GpuContext>) -> Result<()> {
     stop::flag();
-    let board = Board::load(&args.solve.board.board)?;
+    let board = load_board(&args.solve.board.board, &args.take)?;
     refuse_existing(&args.target.out, &[&FILES[..], &[PAGE]].concat(), args.target.force)?;
     let seen = SeenBoards::find(&args.take, &board, gpu)?;
     ensure!(seen.ids.len() > 1, "one camera alone is no rig; flyrig calibrate lens calibrates it");

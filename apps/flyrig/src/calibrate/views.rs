@@ -3,10 +3,11 @@
 use std::{
     collections::BTreeMap,
     ops::ControlFlow,
+    path::Path,
     time::{Duration, Instant},
 };
 
-use anyhow::{Result, anyhow, ensure};
+use anyhow::{Context as _, Result, anyhow, ensure};
 use clap::Args;
 use flyrig_calib::{Board, BoardDetector, BoardShot, BoardView, GrayImage, detector};
 use flyrig_fusion::{InputFormat, Intake};
@@ -45,6 +46,17 @@ const PATIENCE_SECS: f64 = 15.0;
 pub fn open_frames(args: &BoardTakeArgs, gpu: &dyn Fn() -> Result<GpuContext>) -> Result<Take> {
     let options = TakeOptions { fps: args.source.rate.fps, needs: Needs::Frames, ..TakeOptions::default() };
     open_take(&args.source.input, &options, gpu)
+}
+
+/// Loads the board that is searched for in a take.
+///
+/// # Errors
+/// Names the take, and the board's file with what is wrong in it.
+pub fn load_board(board: &Path, take: &BoardTakeArgs) -> Result<Board> {
+    Board::load(board).with_context(|| {
+        let inputs: Vec<_> = take.source.input.iter().map(|path| path.display().to_string()).collect();
+        format!("cannot search {} for a board", inputs.join(", "))
+    })
 }
 
 /// Boards that were seen in a take.
