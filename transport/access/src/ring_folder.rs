@@ -75,7 +75,9 @@ fn unix_secs() -> u64 {
 
 fn read(path: &Path) -> Result<String, AccessError> {
     let of = |error: std::io::Error| {
-        AccessError::file(path, format!("cannot be read ({error}); make a ring with `flyrig keys new`"))
+        let fix =
+            if error.kind() == std::io::ErrorKind::NotFound { "; make a ring with `flyrig keys new`" } else { "" };
+        AccessError::file(path, format!("cannot be read ({error}){fix}"))
     };
     if std::fs::metadata(path).map_err(of)?.len() > MAX_BYTES {
         return Err(AccessError::file(path, "is too large for a file of a ring"));
