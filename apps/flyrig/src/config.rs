@@ -375,7 +375,7 @@ mod tests {
         let error = format!("{:#}", Config::parse("[rig]\n[sim]\nwidht = 64\n").unwrap_err());
         assert!(error.contains("line 3") && error.ends_with("did you mean `width`?"), "{error}");
         let error = format!("{:#}", Config::parse("[sim]\nwidth = 1\n").unwrap_err());
-        assert!(error.starts_with("in [sim]: width"), "{error}");
+        assert!(error.starts_with("in [sim]: simulation: width is 1"), "{error}");
     }
 
     #[test]

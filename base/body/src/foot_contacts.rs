@@ -128,8 +128,8 @@ fn radius(nanos: &[i64], time: i64) -> usize {
     (time / frame).clamp(1, 60) as usize
 }
 
-/// Turns each foot of z-up poses by one rotation, so that its sole is level on average while the source stands on heel and ball: rigs
-/// differ in the slope from ankle to toe. Toes keep their direction.
+/// Turns each foot of y-up poses by one rotation, so that its sole is level on average while the source stands on heel and ball: rigs
+/// differ in the slope from ankle to toe. Toes keep their direction. A foot that never stands is turned as the other one.
 pub(crate) fn level_feet(
     skeleton: &Skeleton,
     legs: &[[usize; 4]; 2],
@@ -137,18 +137,21 @@ pub(crate) fn level_feet(
     source: &[FootSource; 2],
     poses: &mut [Pose],
 ) {
-    for ([_, _, ankle, toe], foot) in legs.iter().zip(source) {
-        let Some(toes) = &foot.toe else { continue };
-        let bind = skeleton.joints()[*ankle].bind_rotation();
+    let bind = |ankle: usize| skeleton.joints()[ankle].bind_rotation();
+    let found = [0, 1].map(|side| {
+        let ([_, _, ankle, _], foot) = (legs[side], &source[side]);
+        let toes = foot.toe.as_ref()?;
         let is_flat = still(nanos, &foot.ankle).into_iter().zip(still(nanos, toes)).map(|(heel, ball)| heel && ball);
         let ups = poses.iter().zip(is_flat).filter(|(_, is_flat)| *is_flat).map(|(pose, _)| {
-            let world = DQuat::from_mat4(&skeleton.world_from_joint(pose)[*ankle]);
-            bind * world.inverse() * DVec3::Z
+            let world = DQuat::from_mat4(&skeleton.world_from_joint(pose)[ankle]);
+            bind(ankle) * world.inverse() * DVec3::Y
         });
-        let Some(up) = ups.sum::<DVec3>().try_normalize().filter(|up| up.angle_between(DVec3::Y) < TILT) else {
-            continue;
-        };
-        let level = bind.inverse() * DQuat::from_rotation_arc(DVec3::Y, up) * bind;
+        ups.sum::<DVec3>().try_normalize().filter(|up| up.angle_between(DVec3::Y) < TILT)
+    });
+    for (side, [_, _, ankle, toe]) in legs.iter().enumerate() {
+        let mirrored = found[1 - side].map(|up| DVec3::new(-up.x, up.y, up.z));
+        let Some(up) = found[side].or(mirrored).filter(|_| source[side].toe.is_some()) else { continue };
+        let level = bind(*ankle).inverse() * DQuat::from_rotation_arc(DVec3::Y, up) * bind(*ankle);
         for pose in &mut *poses {
             pose.joint_rotations[*ankle] = (pose.joint_rotations[*ankle] * level).normalize();
             if toe != ankle {

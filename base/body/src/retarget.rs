@@ -80,10 +80,23 @@ impl MotionClip {
         let last = self.frames.len().saturating_sub(1);
         let start = self.frames.partition_point(|frame| frame.0 < start_nanos).min(last);
         let mut poses: Vec<Pose> = self.frames.iter().map(|(_, moved)| map.pose(moved)).collect();
+        let nanos: Vec<i64> = self.frames.iter().map(|frame| frame.0).collect();
+        let mut feet = map.legs.map(|leg| {
+            let track = |joint: usize| -> Vec<DVec3> {
+                self.frames.iter().map(|(_, moved)| moved[joint].position * map.scale).collect()
+            };
+            FootSource { ankle: track(leg.theirs[2]), toe: leg.their_toe.map(track) }
+        });
+        let legs = map.legs.map(|leg| leg.ours);
+        level_feet(skeleton, &legs, &nanos, &feet, &mut poses);
         let mut lowest: Vec<f64> = poses.iter().map(|pose| map.lowest_foot(pose)).collect();
         lowest.sort_by(f64::total_cmp);
         let floor = lowest.get((lowest.len() as f64 * FLOOR_QUANTILE) as usize).copied().unwrap_or(0.0);
         poses.drain(..start);
+        for foot in &mut feet {
+            foot.ankle.drain(..start);
+            foot.toe.iter_mut().for_each(|toe| drop(toe.drain(..start)));
+        }
         let z_up = DQuat::from_rotation_x(Z_UP_FROM_Y_UP);
         for pose in &mut poses {
             pose.root_translation.y += map.toe_height + options.sole_m - floor;
@@ -93,16 +106,7 @@ impl MotionClip {
         if let Some(reach_m) = options.reach_m {
             shrink_way(&mut poses, reach_m);
         }
-        let nanos: Vec<i64> =
-            self.frames[start.min(self.frames.len())..].iter().map(|frame| frame.0 - self.frames[start].0).collect();
-        let feet = map.legs.map(|leg| {
-            let track = |joint: usize| -> Vec<DVec3> {
-                self.frames[start..].iter().map(|(_, moved)| moved[joint].position * map.scale).collect()
-            };
-            FootSource { ankle: track(leg.theirs[2]), toe: leg.their_toe.map(track) }
-        });
-        let legs = map.legs.map(|leg| leg.ours);
-        level_feet(skeleton, &legs, &nanos, &feet, &mut poses);
+        let nanos: Vec<i64> = nanos[start..].iter().map(|at| at - nanos[start]).collect();
         plant_feet(skeleton, &legs, options.sole_m, &nanos, &feet, &mut poses);
         let keys = nanos.into_iter().zip(poses).collect();
         PoseTrack::new(keys).map_err(|source| BodyError::Track { what: self.what.clone(), source })
