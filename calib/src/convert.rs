@@ -239,11 +239,6 @@ impl Format {
             Self::Anipose => one(anipose::FILE, anipose::text(rig)),
             Self::Mrcal => mrcal::files(dir, rig)?,
         };
-        let is_plain =
-            |name: &str| Path::new(name).file_name().is_some_and(|file| file == name) && !name.contains('\\');
-        if let Some((name, _)) = files.iter().find(|(name, _)| !is_plain(name)) {
-            return Err(bad(dir, format!("a camera's name makes {name:?} no file name; rename the camera")));
-        }
         for (name, bytes) in &files {
             let path = dir.join(name);
             write_whole(&path, |out| out.write_all(bytes))

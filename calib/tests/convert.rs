@@ -121,7 +121,7 @@ fn lenses_that_a_format_cannot_hold_are_refused_and_nothing_is_written() {
     let mut named = rig(&[CUBIC]);
     named.cameras[0].id = "../evil".into();
     let text = Format::Mrcal.write(dir.path(), &named).unwrap_err().to_string();
-    assert!(text.contains("no file name; rename the camera"), "{text}");
+    assert!(text.contains("the camera name '../evil' has a path separator; rename it"), "{text}");
 }
 
 /// Reads one file and returns the rig.

@@ -121,7 +121,7 @@ fn cameras_are_named_by_what_tells_their_images_apart() {
             &["cam00", "cam01"],
         ),
         (&[("shot/cam00.png", 0.0), ("shot/cam01.png", 1.0)], &["cam00", "cam01"]),
-        (&[("rgb\\cam00.png", 0.0), ("rgb\\cam01.png", 1.0)], &["cam00", "cam01"]),
+        (&[(r"rgb\\cam00.png", 0.0), (r"rgb\\cam01.png", 1.0)], &["cam00", "cam01"]),
         (&[("cam00/0001.png", 0.0), ("cam01/0001.png", 1.0)], &["cam00", "cam01"]),
         (&[("cam00/0001.png", 0.0), ("cam00/0002.png", 0.0), ("cam01/0001.png", 1.0)], &["cam00", "cam01"]),
         (&[("cam00/rgb/0001.png", 0.0), ("cam01/rgb/0001.png", 1.0)], &["cam00", "cam01"]),
