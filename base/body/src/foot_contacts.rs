@@ -90,9 +90,10 @@ impl Sole {
         let (ankle, toe) = (origins[leg[2]], origins[leg[3]]);
         let long = if leg[2] == leg[3] { 0.13 } else { (toe.z - ankle.z).abs().max(0.05) };
         // Shoes are longer by about half the sole's thickness.
-        let point = |x: f64, along: f64| DVec3::new(x, -ankle.y - sole_m, along * long + 0.5 * sole_m * along.signum());
+        let point = |x: f64, along: f64, longer: f64| DVec3::new(x, -ankle.y - sole_m, along * long + longer * sole_m);
         let across = if leg[2] == leg[3] { 0.0 } else { toe.x - ankle.x };
-        let canonical = [point(0.0, -0.55), point(across, 1.0), point(across, 1.55)];
+        // The ball stays below the joint of the toes, about which the foot turns.
+        let canonical = [point(0.0, -0.55, -0.5), point(across, 1.0, 0.0), point(across, 1.55, 0.5)];
         Self { canonical, half_width: 0.28 * long + 0.25 * sole_m }
     }
 
