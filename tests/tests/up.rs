@@ -10,7 +10,8 @@ use glam::{DQuat, DVec2};
 
 const PROGRAM: &str = env!("CARGO_BIN_EXE_flyrig-under-test");
 
-const SIM: &str = "width = 320\nheight = 320\ntexture_px = 256\nfps = 10.0\nframes = 3\ncameras.count = 3\n";
+const SIM: &str = "width = 320\nheight = 320\ntexture_px = 256\nfps = 10.0\nframes = 3\n\
+    [cameras]\ncount = 3\nradial = [0.0, 0.0]\ntangential = [0.0, 0.0]\n";
 
 /// Returns a camera that was turned about its optical axis by quarter turns, so that its images turn clockwise.
 fn turned(camera: &Camera, quarters: u32) -> Camera {
@@ -51,11 +52,12 @@ fn cameras_on_their_side_or_upside_down_find_up_by_the_person() {
     let folder = tempfile::tempdir().unwrap();
     std::fs::write(folder.path().join("sim.toml"), SIM).unwrap();
     let command = |args: &[&str]| run(PROGRAM, args, folder.path()).unwrap();
-    let exported = command(&["sim", "export", "sim.toml", "--out", "take", "--no-truth"]);
+    let exported = command(&["sim", "export", "sim.toml", "--out", "take", "--frames", "3", "--no-truth"]);
     assert_eq!(exported.code, Some(0), "{exported:?}");
     let take = folder.path().join("take");
     let rig = load_calibration(&take, &|_| None).unwrap();
-    assert!(rig.cameras.iter().all(|camera| camera.intrinsics.lens == Lens::PINHOLE), "turned() knows no other lens");
+    let is_pinhole = |camera: &Camera| camera.intrinsics.lens == Lens::PINHOLE;
+    assert!(rig.cameras.iter().all(is_pinhole), "turned() knows no other lens: {:?}", rig.cameras[0].intrinsics.lens);
     for quarters in [1, 2, 3] {
         let (name, out) = (format!("turned{quarters}"), format!("converted{quarters}"));
         write_turned(&take, &rig, quarters, &folder.path().join(&name));
