@@ -109,7 +109,7 @@ fn dispatch(cli: &Cli) -> Result<()> {
         Command::Avatar { action } => avatar::avatar(action, &|| open_gpu(cli.program.adapter.as_deref())),
         Command::Eval(args) => eval::eval(args, &open_gpu(cli.program.adapter.as_deref())?),
         Command::Sim { action: SimAction::Export(args) } => {
-            let config = args.config.as_deref().map(simulator_file::load_any).transpose()?.unwrap_or_default();
+            let config = args.config.as_deref().map(sim_export::load_config).transpose()?.unwrap_or_default();
             sim_export::sim_export(args, &config, &open_gpu(cli.program.adapter.as_deref())?)
         }
         Command::Sim { action: SimAction::Print } => {

@@ -1,12 +1,17 @@
 //! `flyrig sim export`: a simulated capture as a data set.
 
-use std::{path::PathBuf, time::Instant};
+use std::{
+    path::{Path, PathBuf},
+    time::Instant,
+};
 
 use anyhow::Result;
 use clap::{Args, Subcommand};
 use flyrig_gpu::GpuContext;
 use flyrig_report::{progress_bar, stop};
 use flyrig_sim::{ExportOptions, SimConfig, Simulator, export};
+
+use crate::{config::Config, simulator_file};
 
 /// Arguments of `flyrig sim export`.
 #[derive(Debug, Args)]
@@ -31,6 +36,16 @@ pub enum SimAction {
     Print,
     /// Write a simulated capture in the layout of EasyMocap, which `flyrig eval` reads, with the ground truth.
     Export(SimExportArgs),
+}
+
+/// Reads and checks a file of the simulated rig, or a rig's configuration with a table `[sim]`.
+///
+/// # Errors
+/// Those of [`simulator_file::load`] and [`Config::load_for_capture`].
+pub fn load_config(path: &Path) -> Result<SimConfig> {
+    let is_rig = std::fs::read_to_string(path)
+        .is_ok_and(|text| text.parse::<toml::Table>().is_ok_and(|table| table.contains_key("sim")));
+    if is_rig { Ok(Config::load_for_capture(path)?.sim) } else { simulator_file::load(path) }
 }
 
 /// Runs the command.
@@ -71,4 +86,23 @@ pub fn sim_export(args: &SimExportArgs, config: &SimConfig, gpu: &GpuContext) ->
         );
     }
     Ok(())
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn the_table_of_a_rigs_configuration_is_read_too() {
+        let folder = tempfile::tempdir().unwrap();
+        let file = folder.path().join("rig.toml");
+        std::fs::write(&file, "[source]\nkind = \"sim\"\n[sim]\nwidth = 32\nheight = 48\n").unwrap();
+        let config = load_config(&file).unwrap();
+        assert_eq!((config.width, config.height), (32, 48));
+        std::fs::write(&file, "[sim]\nwidht = 32\n").unwrap();
+        let error = format!("{:#}", load_config(&file).unwrap_err());
+        assert!(error.contains("line 2") && error.ends_with("did you mean `width`?"), "{error}");
+        std::fs::write(&file, "width = 64\n").unwrap();
+        assert_eq!(load_config(&file).unwrap().width, 64);
+    }
 }

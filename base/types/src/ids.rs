@@ -52,7 +52,15 @@ impl CameraId {
         } else {
             return Ok(());
         };
-        Err(CameraNameError { name: shortened(name).into_owned(), fault })
+        let mut seen = String::new();
+        for char in name.chars().take(2 * MAX_NAME) {
+            if is_unseen(char) {
+                seen.extend(char.escape_unicode());
+            } else {
+                seen.push(char);
+            }
+        }
+        Err(CameraNameError { name: shortened(&seen).into_owned(), fault })
     }
 }
 

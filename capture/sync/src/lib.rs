@@ -2,6 +2,7 @@
 //!
 //! Times are nanoseconds of the capturing host's `CLOCK_MONOTONIC`; an image's time is the middle of its exposure.
 
+mod arrivals;
 mod clocks;
 #[cfg(test)]
 mod clocks_tests;

@@ -8,7 +8,7 @@ use std::{
 use flyrig_types::{CameraId, Frame, FrameSet, SetKind};
 use serde::{Deserialize, Serialize};
 
-use crate::overdue::Arrivals;
+use crate::arrivals::Arrivals;
 use crate::settings::SyncSettings;
 
 /// Most frames of a camera that wait for a frame set: a runaway clock must not exhaust the memory.

@@ -16,8 +16,6 @@ pub const MAX_VIEWPOINT_SIDE: u32 = 4096;
 
 /// Rates that a subscriber may request, images per second.
 const RATES: RangeInclusive<f64> = 0.01..=1000.0;
-/// Longest name of a requested camera that is kept, characters.
-const MAX_CAMERA_NAME: usize = 64;
 
 /// Time for which a request that could not be drawn is refused.
 const REFUSAL: Duration = Duration::from_secs(60);
@@ -238,13 +236,10 @@ impl Leases {
         let topic = format!("viewpoint of {subscriber}");
         let ViewpointRequest { camera, max_fps } = request?;
         keys::check_name("subscriber", subscriber)?;
-        let Some(mut camera) = camera else {
+        let Some(camera) = camera else {
             self.active.retain(|lease| lease.viewpoint.subscriber != subscriber);
             return Ok(());
         };
-        let mut name: String = camera.id.as_str().chars().take(MAX_CAMERA_NAME).collect();
-        clean(&mut name);
-        camera.id = name.into();
         check_camera(&topic, &camera, max_fps)?;
         let viewpoint = Viewpoint {
             subscriber: subscriber.to_owned(),

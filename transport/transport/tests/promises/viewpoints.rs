@@ -186,13 +186,19 @@ fn due_viewpoints_are_watched_ones_at_their_own_rate() {
 
     // A request without a subscription is granted and never drawn.
     let session = client(publisher.endpoints());
-    let camera = serde_json::to_string(&camera("\u{1b}[2J", Lens::PINHOLE)).unwrap();
-    let question = format!(r#"{{"schema_version":1,"max_fps":5.0,"camera":{camera}}}"#);
-    let replies = session.get("flyrig/v1/test/viewpoint/by-hand").payload(question).wait().unwrap();
-    assert!(replies.recv().unwrap().result().is_ok());
+    let ask = |name: &str| {
+        let camera = serde_json::to_string(&camera(name, Lens::PINHOLE)).unwrap();
+        let question = format!(r#"{{"schema_version":1,"max_fps":5.0,"camera":{camera}}}"#);
+        let replies = session.get("flyrig/v1/test/viewpoint/by-hand").payload(question).wait().unwrap();
+        let reply = replies.recv().unwrap();
+        String::from_utf8(reply.result().unwrap().payload().to_bytes().into_owned()).unwrap()
+    };
+    let refused = ask("\u{1b}[2J");
+    assert!(refused.contains("has characters that cannot be seen") && !refused.contains('\u{1b}'), "{refused}");
+    ask("mine too");
     let by_hand = |viewpoint: &Viewpoint| viewpoint.subscriber == "by-hand";
     let asked = publisher.requested_viewpoints().into_iter().find(by_hand).unwrap();
-    assert_eq!(asked.camera.id.as_str(), "\\u{1b}[2J");
+    assert_eq!(asked.camera.id.as_str(), "mine too");
     assert!(!publisher.due_viewpoints(start + Duration::from_secs(60)).iter().any(by_hand));
     session.close().wait().unwrap();
 }
