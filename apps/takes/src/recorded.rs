@@ -71,7 +71,7 @@ pub struct RecordedCameras {
     pub lenses: Vec<(CameraId, Intrinsics)>,
     /// Why the recording of another program has no rig.
     pub lacks: Option<String>,
-    /// What was left out of the recording of another program, one text each.
+    /// Parts of the recording of another program that were left out, one text each.
     pub notes: Vec<String>,
 }
 

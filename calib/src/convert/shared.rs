@@ -52,7 +52,7 @@ pub(super) fn one_file(path: &Path, ending: &str) -> Result<PathBuf, CalibError>
 }
 
 /// Parts of keys that speak of a lens, axes, units or orientation.
-const SPEAKING_PARTS: [&str; 33] = [
+const SPEAKING_PARTS: [&str; 34] = [
     "distort",
     "fisheye",
     "lens",
@@ -74,7 +74,8 @@ const SPEAKING_PARTS: [&str; 33] = [
     "convention",
     "unit",
     "orient",
-    "rotat",
+    "rotate",
+    "rotation",
     "extrinsic",
     "transform",
     "pose",

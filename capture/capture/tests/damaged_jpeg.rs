@@ -39,12 +39,12 @@ impl Random {
     }
 }
 
-/// What a camera looks at.
+/// Scene before a camera.
 #[derive(Debug, Clone, Copy, PartialEq)]
 enum Kind {
     /// Walls, floor, furniture with straight edges, texture, a person who walks.
     Room,
-    /// The same at a fiftieth of the light.
+    /// That scene at a fiftieth of the light.
     Dark,
     /// Colours that change slowly.
     Gradient,

@@ -1,4 +1,4 @@
-//! What exporters and extensions of the format add.
+//! Additions of exporters and extensions of the format.
 
 use flyrig_body::{GltfHuman, RetargetOptions, Skeleton, Template, load_gltf_motion, skin_mesh};
 use flyrig_types::PoseTrack;

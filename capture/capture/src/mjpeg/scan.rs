@@ -209,7 +209,7 @@ impl<'a> Bits<'a> {
 const MAX_SURPLUS: usize = 4;
 /// Places of the vertical frequencies 1 to 7 without a horizontal one in zigzag order.
 const COLUMN: [usize; 7] = [2, 3, 9, 10, 20, 21, 35];
-/// The same places as bits.
+/// These places as bits.
 const COLUMN_SET: u64 = 1 << 2 | 1 << 3 | 1 << 9 | 1 << 10 | 1 << 20 | 1 << 21 | 1 << 35;
 
 /// Everything before the scan.

@@ -42,7 +42,7 @@ impl FrameRate {
 pub(super) struct RateMeter {
     /// Capture time and sequence number of frames at least [`SAMPLE`] apart; the first is the newest that is [`WINDOW`] old.
     samples: VecDeque<(i64, u64)>,
-    /// The same of the last frame.
+    /// Capture time and sequence number of the last frame.
     last: Option<(i64, u64)>,
 }
 

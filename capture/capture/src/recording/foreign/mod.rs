@@ -43,7 +43,7 @@ pub struct ForeignCameras {
     pub up: Option<DVec3>,
     /// Reason why some camera has no lens or no pose; `None` if all have both.
     pub lacks: Option<String>,
-    /// What was left out of the file or read in a way of its own, one text each.
+    /// Parts of the file that were left out or read in a way of their own, one text each.
     pub notes: Vec<String>,
 }
 
