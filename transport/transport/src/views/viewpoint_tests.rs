@@ -222,12 +222,12 @@ fn numbers_that_drawing_cannot_take_are_refused_by_name() {
     assert!(refusal(&|camera| camera.intrinsics.width = 0).contains("width"));
     // Denormal numbers beside usable ones are zeros.
     assert_eq!(refusal(&|camera| camera.camera_from_world.translation.x = 5e-324), "");
-    // A name is not repeated at length.
+    // A name is checked first, and not repeated at length.
     let reason = refusal(&|camera| {
         camera.id = "A".repeat(200_000).into();
         camera.intrinsics.focal_px.x = -1.0;
     });
-    assert!(reason.contains("focal length fx") && reason.len() < 200, "{}", reason.len());
+    assert!(reason.contains("AAA...' is too long; rename it") && reason.len() < 240, "{reason}");
 }
 
 /// Asks for a viewpoint, or gives it back with `None`.
