@@ -324,7 +324,7 @@ fn the_body_is_taken_from_among_other_skinned_things() {
         let found = file.load().unwrap();
         assert_eq!(found.template, expected.template, "flag first: {first}");
     }
-    // Joints of one name are told apart.
+    // Joints that share a name stay distinct.
     let mut file = plain();
     file.json["nodes"][5]["name"] = json!("LeftUpLeg");
     let names: Vec<String> =

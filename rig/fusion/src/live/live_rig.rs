@@ -51,16 +51,16 @@ type Attempt<T> = Result<Result<T, FusionError>, String>;
 /// ```no_run
 /// use std::time::Duration;
 /// use flyrig_fusion::{Intake, LiveRig, LiveViews, OutputSettings, Session};
-/// # fn parts() -> (Session, Intake) { unimplemented!() }
 ///
-/// let (session, intake) = parts();
+/// # fn follow(session: Session, intake: Intake) -> Result<(), flyrig_fusion::FusionError> {
 /// let mut rig = LiveRig::new(session, intake, LiveViews::new(&OutputSettings::default()), None);
 /// while !rig.ended() {
 ///     if let Some(step) = rig.step(Duration::from_millis(200), None)? {
 ///         println!("frame set {}: {:?}", step.set.index, step.outcome);
 ///     }
 /// }
-/// # Ok::<(), flyrig_fusion::FusionError>(())
+/// # Ok(())
+/// # }
 /// ```
 pub struct LiveRig {
     /// People.

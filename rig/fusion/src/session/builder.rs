@@ -23,16 +23,17 @@ use crate::{
 ///     body::{ShapeParams, default_template},
 ///     gpu::{AdapterChoice, GpuContext},
 /// };
-/// # fn rig() -> flyrig_fusion::types::Rig { unimplemented!() }
 ///
-/// let (rig, settings) = (rig(), SessionSettings::default());
+/// # fn build(rig: flyrig_fusion::types::Rig) -> Result<(), Box<dyn std::error::Error>> {
+/// let settings = SessionSettings::default();
 /// let plates: Vec<_> = rig.cameras.iter().map(|_| None).collect();
 /// let body = default_template(&ShapeParams::default())?;
 /// let perception = EstimatedPerception::new(&rig, &body, &settings.perception, &plates)?;
 /// let gpu = GpuContext::new(&AdapterChoice::Best)?;
 /// let session = SessionBuilder::new(gpu, rig).settings(settings).perception(perception).build()?;
 /// assert!(!session.has_people(), "no person was seen yet");
-/// # Ok::<(), Box<dyn std::error::Error>>(())
+/// # Ok(())
+/// # }
 /// ```
 pub struct SessionBuilder {
     gpu: GpuContext,
