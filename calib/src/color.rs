@@ -103,6 +103,18 @@ pub struct ColorFit {
     pub cameras: Vec<CameraColors>,
     /// Unknowns that were estimated besides the gains.
     pub model: ColorModel,
+    /// Typical difference of a camera's light from the points' means in every second instant, as a fraction, with the colours that the
+    /// other instants give.
+    pub kept_back: f64,
+}
+
+/// Returns the typical difference of a camera's light from the mean of the cameras that see the same point, as a fraction: of every
+/// second instant, those that [`ColorFit::kept_back`] is measured on. One colour match per camera.
+#[must_use]
+pub fn color_difference(colors: &[ColorMatch], points: &[ColorPoint]) -> f64 {
+    let odd = points.iter().filter(|point| point.instant % 2 == 1);
+    let usable: Vec<ColorPoint> = odd.filter_map(|point| usable(point, colors.len())).collect();
+    typical(differences(&usable, colors).into_iter().map(|(_, off)| off))
 }
 
 /// Matches the colours of cameras.
@@ -142,6 +154,7 @@ pub fn match_colors(ids: &[CameraId], points: &[ColorPoint]) -> Result<ColorFit,
     if !solved.iter().all(is_plausible) {
         (model, solved) = (gains, solve(ids.len(), &usable, gains));
     }
+    let kept_back = color_difference(&solve(ids.len(), &halves[0], model), &halves[1]);
     let by_half = halves.each_ref().map(|half| solve(ids.len(), half, model));
     let (before, after) = (differences(&usable, &vec![ColorMatch::NONE; ids.len()]), differences(&usable, &solved));
     let of = |slot: usize, all: &[(usize, f64)]| typical(all.iter().filter(|(of, _)| *of == slot).map(|(_, off)| *off));
@@ -155,7 +168,7 @@ pub fn match_colors(ids: &[CameraId], points: &[ColorPoint]) -> Result<ColorFit,
         halves: apart(slot),
         difference: (of(slot, &before), of(slot, &after)),
     };
-    Ok(ColorFit { cameras: (0..ids.len()).map(camera).collect(), model })
+    Ok(ColorFit { cameras: (0..ids.len()).map(camera).collect(), model, kept_back })
 }
 
 fn is_plausible(color: &ColorMatch) -> bool {

@@ -91,6 +91,15 @@ pub struct PersonCamera {
     pub lag_halves_s: Option<f64>,
 }
 
+/// How well the cameras agree on a person.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct Agreement {
+    /// Median reprojection error of the landmarks, pixels.
+    pub error_px: f64,
+    /// Standard deviation of the angle between outermost tangent planes of two cameras, radians; `None` without silhouettes.
+    pub planes_rad: Option<f64>,
+}
+
 /// Result of [`calibrate_person`].
 #[derive(Debug, Clone, PartialEq)]
 pub struct PersonFit {
@@ -105,6 +114,9 @@ pub struct PersonFit {
     /// Standard deviation of the angle between outermost tangent planes of two cameras, with the old calibration and now; radians.
     /// `None` without silhouettes.
     pub planes_rad: Option<(f64, f64)>,
+    /// Agreement with the old calibration and now, over both halves of the take, each judged by the solve of the other half. `None` where
+    /// a half has too few instants.
+    pub kept_back: Option<(Agreement, Agreement)>,
     /// Left-right confusions of the network that were corrected: groups of limbs in an image.
     pub corrections: usize,
 }
@@ -138,6 +150,7 @@ pub fn calibrate_person(
     }
     let part = |from, to| solve(rig, &tracks.part(from, to), limbs, options, Some(&whole.estimate));
     let halves = part(0.0, 0.5).zip(part(0.5, 1.0));
+    let kept_back = halves.as_ref().and_then(|(first, second)| kept_back(rig, &tracks, [first, second]));
     let before = motions(rig);
     let cameras = (0..rig.cameras.len())
         .map(|slot| {
@@ -177,6 +190,7 @@ pub fn calibrate_person(
         instants: whole.estimate.points.len(),
         sigma_px: whole.sigma_px,
         planes_rad: whole.planes_rad,
+        kept_back,
         corrections,
     })
 }
@@ -231,6 +245,53 @@ impl Solved {
             .collect();
         shifts.iter().sum::<f64>() / shifts.len().max(1) as f64
     }
+}
+
+/// Judges each half's solve, and the old calibration, by the other half.
+fn kept_back(rig: &Rig, tracks: &PersonTracks, halves: [&Solved; 2]) -> Option<(Agreement, Agreement)> {
+    let unseen = [tracks.part(0.5, 1.0), tracks.part(0.0, 0.5)];
+    let old = PersonEstimate { cameras: motions(rig), lags_s: vec![0.0; rig.cameras.len()], points: Vec::new() };
+    let judge = |estimates: [&PersonEstimate; 2]| {
+        let (mut errors, mut angles) = (Vec::new(), Vec::new());
+        for (part, estimate) in unseen.iter().zip(estimates) {
+            judge_half(rig, part, estimate, &mut errors, &mut angles)?;
+        }
+        let planes_rad = median(&mut angles).map(|angle| SIGMA_PER_DEVIATION * angle);
+        Some(Agreement { error_px: median(&mut errors)?, planes_rad })
+    };
+    Some((judge([&old, &old])?, judge(halves.map(|half| &half.estimate))?))
+}
+
+/// Collects reprojection errors, pixels, and angles between tangent planes, radians, of tracks that an estimate was not made from.
+fn judge_half(
+    rig: &Rig,
+    tracks: &PersonTracks,
+    estimate: &PersonEstimate,
+    errors: &mut Vec<f64>,
+    angles: &mut Vec<f64>,
+) -> Option<()> {
+    let intrinsics: Vec<Intrinsics> = rig.cameras.iter().map(|camera| camera.intrinsics).collect();
+    let intervals_s: Vec<f64> = (0..rig.cameras.len()).map(|slot| tracks.interval_s(slot)).collect();
+    let instants = instants(&intrinsics, tracks, &intervals_s, estimate)?;
+    let mut at = estimate.clone();
+    at.points = vec![vec![DVec3::ZERO; tracks.landmarks()]; instants.len()];
+    let known = Known {
+        intrinsics: &intrinsics,
+        tracks,
+        intervals_s: &intervals_s,
+        instants: &instants,
+        limbs: &[],
+        before: at.clone(),
+        prior: (1.0, 1.0),
+        lag_sigma_s: 1.0,
+        lags: false,
+        ahead: rig.center_of_attention(),
+    };
+    triangulate(&known, &mut at);
+    each_error(&known, &at, |_, _, px| errors.push(px));
+    let touches = (0..instants.len()).flat_map(|instant| known.touches(&at, instant));
+    angles.extend(touches.map(|(.., found)| found.angle.abs()));
+    Some(())
 }
 
 fn solve(

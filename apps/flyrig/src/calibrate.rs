@@ -16,6 +16,8 @@ use anyhow::Result;
 use clap::Subcommand;
 use flyrig_gpu::GpuContext;
 
+pub use convert::parse_scale;
+
 /// Subcommands of `flyrig calibrate`.
 #[derive(Debug, Subcommand)]
 pub enum CalibrateAction {

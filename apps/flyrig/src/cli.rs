@@ -7,9 +7,9 @@ use flyrig_report::arguments::ProgramArgs;
 use flyrig_training::TrainArgs;
 
 use crate::{
-    avatar::AvatarAction, calibrate::CalibrateAction, demo::DemoArgs, eval::EvalArgs, keys::KeysAction,
-    plate::PlateArgs, recording::RecordArgs, replay::ReplayArgs, serve::ServeArgs, sim_export::SimAction,
-    stream_recording::PlayArgs, sync_check::SyncCheckArgs, view::ViewArgs, watch::WatchArgs,
+    avatar::AvatarAction, calibrate::CalibrateAction, demo::DemoArgs, eval::EvalArgs, import::ImportArgs,
+    keys::KeysAction, plate::PlateArgs, recording::RecordArgs, replay::ReplayArgs, serve::ServeArgs,
+    sim_export::SimAction, stream_recording::PlayArgs, sync_check::SyncCheckArgs, view::ViewArgs, watch::WatchArgs,
 };
 
 /// Live free-viewpoint video of a person from a few cameras.
@@ -62,6 +62,8 @@ pub enum Command {
     },
     /// Record the cameras of a configuration into an MCAP file, without tracking.
     Record(RecordArgs),
+    /// Make a take of videos or images and a calibration of other programs, and correct the calibration by the person in it.
+    Import(ImportArgs),
     /// Read a recording, print a summary, and export it with --export. To run the rig on it, set source.kind = "mcap".
     Replay(ReplayArgs),
     /// Estimate each camera's time offset from the first camera: from silhouettes of a person where the calibration is known

@@ -11,6 +11,7 @@ mod config;
 mod demo;
 mod doctor;
 mod eval;
+mod import;
 mod keys;
 mod opening;
 mod plate;
@@ -93,6 +94,7 @@ fn dispatch(cli: &Cli) -> Result<()> {
             let gpu = (config.source.kind == SourceKind::Sim).then(|| open_gpu(adapter)).transpose()?;
             capture::capture(&config, key.as_deref(), gpu.as_ref())
         }
+        Command::Import(args) => import::run(args, &|| open_gpu(cli.program.adapter.as_deref())),
         Command::Replay(args) => replay::replay(args),
         Command::SyncCheck(args) => sync_check::sync_check(args, &|| open_gpu(cli.program.adapter.as_deref())),
         Command::Plate(args) => plate::plate(args, &|| open_gpu(cli.program.adapter.as_deref())),

@@ -8,6 +8,8 @@ use flyrig_capture::{VideoOptions, VideoReplay, folder_image_size, read_image};
 use flyrig_fusion::{Origin, PerceptionSettings};
 use flyrig_types::{Camera, CameraId, Image, Rig, shortened};
 
+use crate::footage::{video_camera, video_files};
+
 /// Files of a calibration, of which at least one lies in a calibrated folder.
 const CALIBRATION_FILES: [&str; 3] = ["calibration.toml", "intri.yml", "extri.yml"];
 
@@ -94,10 +96,12 @@ fn image_size(root: &Path, id: &CameraId) -> Option<(u32, u32)> {
     folder_image_size(root, id).ok().or_else(video_size)
 }
 
-/// Returns the path of a camera's video, `videos/CAM.mp4`.
+/// Returns the path of a camera's video, `videos/CAM.mp4` or with the ending of another video that is there.
 #[must_use]
 pub fn video_file(root: &Path, id: &CameraId) -> PathBuf {
-    root.join("videos").join(format!("{id}.mp4"))
+    let found =
+        video_files(&root.join("videos")).unwrap_or_default().into_iter().find(|file| video_camera(file) == *id);
+    found.unwrap_or_else(|| root.join("videos").join(format!("{id}.mp4")))
 }
 
 /// Returns the folder of a data set's plates: that of the settings, or `background`.

@@ -8,6 +8,9 @@ use flyrig_types::{CameraId, Rig};
 
 use crate::{dataset, recorded::recorded_cameras};
 
+/// Endings of video files, in any case.
+pub(crate) const VIDEO_ENDINGS: [&str; 7] = ["mp4", "mov", "m4v", "mkv", "avi", "webm", "mts"];
+
 /// Stored images of several cameras.
 ///
 /// ```
@@ -21,6 +24,8 @@ use crate::{dataset, recorded::recorded_cameras};
 pub enum Footage {
     /// Folder in EasyMocap's layout, with `images/CAM/*`.
     Folder(PathBuf),
+    /// Folder of the same layout with `videos/CAM.mp4` (or another ending) and no images.
+    VideoFolder(PathBuf),
     /// File of `flyrig record`, or MCAP file of another program.
     Recording(PathBuf),
     /// Video files, one per camera, each named after its camera.
@@ -33,6 +38,8 @@ pub struct OpenFootage {
     pub sources: Vec<Box<dyn CameraSource>>,
     /// Frames of the longest camera of a folder; 0 where the number is unknown before reading.
     pub frames: usize,
+    /// Duration of the longest camera, seconds, where it is known before reading.
+    pub secs: Option<f64>,
 }
 
 impl Footage {
@@ -40,7 +47,13 @@ impl Footage {
     #[must_use]
     pub fn from_dataset(path: &Path) -> Self {
         let path_buf = path.to_owned();
-        if has_ending(path, "mcap") && !path.is_dir() { Self::Recording(path_buf) } else { Self::Folder(path_buf) }
+        if has_ending(path, "mcap") && !path.is_dir() {
+            Self::Recording(path_buf)
+        } else if path.join("videos").is_dir() && !path.join("images").is_dir() {
+            Self::VideoFolder(path_buf)
+        } else {
+            Self::Folder(path_buf)
+        }
     }
 
     /// Finds the footage that a command line names: one folder, one recording, or videos.
@@ -67,7 +80,7 @@ impl Footage {
     #[must_use]
     pub fn folder(&self) -> Option<&Path> {
         match self {
-            Self::Folder(root) => Some(root),
+            Self::Folder(root) | Self::VideoFolder(root) => Some(root),
             Self::Recording(_) | Self::Videos(_) => None,
         }
     }
@@ -78,7 +91,7 @@ impl Footage {
     /// The calibration is missing or wrong.
     pub fn load_rig(&self, chosen: &[CameraId]) -> Result<Rig> {
         match self {
-            Self::Folder(root) => dataset::load_rig(root, chosen),
+            Self::Folder(root) | Self::VideoFolder(root) => dataset::load_rig(root, chosen),
             Self::Recording(path) => {
                 let recorded = recorded_cameras(path)?;
                 // The error says what is missing.
@@ -100,36 +113,65 @@ impl Footage {
             Self::Folder(root) => {
                 let sources = FolderReplay::open(root, cameras, options)?;
                 let frames = sources.iter().map(FolderReplay::remaining).max().unwrap_or(0);
-                Ok(OpenFootage { sources: sources.into_iter().map(boxed).collect(), frames })
+                let secs = Some(frames as f64 / options.fps);
+                Ok(OpenFootage { sources: sources.into_iter().map(boxed).collect(), frames, secs })
+            }
+            Self::VideoFolder(root) => {
+                let files = match cameras {
+                    Some(ids) => ids.iter().map(|id| dataset::video_file(root, id)).collect(),
+                    None => video_files(&root.join("videos"))?,
+                };
+                open_videos(&files, cameras, options)
             }
             Self::Recording(path) => {
                 let recorded = recorded_cameras(path)?;
                 let ids = cameras.unwrap_or(&recorded.ids);
                 let open = |id: &CameraId| Ok(boxed(McapReplay::open_camera(&recorded.images_of(id), path)?));
                 let sources = ids.iter().map(open).collect::<Result<_>>()?;
-                Ok(OpenFootage { sources, frames: 0 })
+                Ok(OpenFootage { sources, frames: 0, secs: None })
             }
-            Self::Videos(files) => {
-                let open = |(id, file): (CameraId, &PathBuf)| {
-                    Ok(boxed(VideoReplay::open(&id, file, &VideoOptions::default())?))
-                };
-                for file in files {
-                    video_camera(file).check().with_context(|| file.display().to_string())?;
-                }
-                let all = files.iter().map(|file| (video_camera(file), file));
-                let sources = match cameras {
-                    None => all.map(open).collect::<Result<_>>()?,
-                    Some(ids) => {
-                        let all: Vec<_> = all.collect();
-                        let find = |id: &CameraId| all.iter().find(|(known, _)| known == id).cloned();
-                        let found = ids.iter().map(|id| find(id).with_context(|| format!("no video of camera {id}")));
-                        found.map(|video| open(video?)).collect::<Result<_>>()?
-                    }
-                };
-                Ok(OpenFootage { sources, frames: 0 })
-            }
+            Self::Videos(files) => open_videos(files, cameras, &FolderOptions::default()),
         }
     }
+}
+
+/// Opens videos, each of the camera that it is named after.
+fn open_videos(files: &[PathBuf], cameras: Option<&[CameraId]>, options: &FolderOptions) -> Result<OpenFootage> {
+    for file in files {
+        video_camera(file).check().with_context(|| file.display().to_string())?;
+    }
+    let all: Vec<(CameraId, &PathBuf)> = files.iter().map(|file| (video_camera(file), file)).collect();
+    let chosen = match cameras {
+        None => all,
+        Some(ids) => {
+            let find = |id: &CameraId| all.iter().find(|(known, _)| known == id).cloned();
+            ids.iter().map(|id| find(id).with_context(|| format!("no video of camera {id}"))).collect::<Result<_>>()?
+        }
+    };
+    let video = VideoOptions { frames: options.frames.clone(), ..VideoOptions::default() };
+    let videos =
+        chosen.iter().map(|(id, file)| Ok(VideoReplay::open(id, file, &video)?)).collect::<Result<Vec<_>>>()?;
+    let secs = videos.iter().filter_map(VideoReplay::header_secs).reduce(f64::max);
+    Ok(OpenFootage { sources: videos.into_iter().map(boxed).collect(), frames: 0, secs })
+}
+
+/// Lists the videos of a folder by name.
+///
+/// # Errors
+/// The folder cannot be listed, or holds no video.
+pub(crate) fn video_files(folder: &Path) -> Result<Vec<PathBuf>> {
+    let listed = std::fs::read_dir(folder).with_context(|| format!("{} cannot be listed", folder.display()))?;
+    let paths = listed.flatten().map(|entry| entry.path());
+    let mut files: Vec<PathBuf> = paths.filter(|path| is_video(path)).collect();
+    ensure!(!files.is_empty(), "{} holds no videos ({})", folder.display(), VIDEO_ENDINGS.join(", "));
+    files.sort();
+    Ok(files)
+}
+
+/// Returns whether a path is a file with the ending of a video, and is not hidden.
+pub(crate) fn is_video(path: &Path) -> bool {
+    let is_hidden = path.file_name().is_some_and(|name| name.to_string_lossy().starts_with('.'));
+    !is_hidden && path.is_file() && VIDEO_ENDINGS.iter().any(|ending| has_ending(path, ending))
 }
 
 fn boxed<S: CameraSource + 'static>(source: S) -> Box<dyn CameraSource> {
@@ -137,7 +179,7 @@ fn boxed<S: CameraSource + 'static>(source: S) -> Box<dyn CameraSource> {
 }
 
 /// Returns the camera of a video: the file's name without its ending.
-fn video_camera(file: &Path) -> CameraId {
+pub(crate) fn video_camera(file: &Path) -> CameraId {
     file.file_stem().map(|stem| stem.to_string_lossy().into_owned()).unwrap_or_default().into()
 }
 
@@ -159,6 +201,8 @@ mod tests {
         let find = |names: &[&str]| Footage::from_paths(&names.iter().map(|name| at(name)).collect::<Vec<_>>());
         assert_eq!(find(&["dir.mcap"]).unwrap(), Footage::Folder(at("dir.mcap")));
         assert_eq!(find(&["take.MCAP"]).unwrap(), Footage::Recording(at("take.MCAP")));
+        std::fs::create_dir_all(at("videos/videos")).unwrap();
+        assert_eq!(find(&["videos"]).unwrap(), Footage::VideoFolder(at("videos")));
         assert_eq!(find(&["a.mp4"]).unwrap(), Footage::Videos(vec![at("a.mp4")]));
         assert_eq!(find(&["a.mp4", "b.mp4"]).unwrap(), Footage::Videos(vec![at("a.mp4"), at("b.mp4")]));
         let error = find(&["nowhere"]).unwrap_err().to_string();

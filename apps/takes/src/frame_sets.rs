@@ -30,10 +30,10 @@ impl FrameSelection {
 
     /// Opens the frame sets of a rig; returns the number of a folder's frames with them.
     pub fn open_sets(&self, rig: &Rig, with_masks: bool) -> Result<(FrameSets, usize)> {
-        let OpenFootage { sources, frames } = self.open(&rig.cameras, with_masks)?;
+        let OpenFootage { sources, frames, .. } = self.open(&rig.cameras, with_masks)?;
         let sync = SyncSettings {
-            // Timestamps of a folder follow from the frame numbers; those of a recording are the cameras'.
-            window_nanos: (!self.is_encoded()).then(|| self.half_period_nanos()),
+            // Timestamps of a folder follow from the frame numbers; those of recordings and videos are the cameras'.
+            window_nanos: matches!(self.footage, Footage::Folder(_)).then(|| self.half_period_nanos()),
             lags_nanos: self.lags_nanos.clone(),
             ..SyncSettings::default()
         };

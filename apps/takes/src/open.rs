@@ -84,7 +84,9 @@ impl Take {
         let needs_calibration = options.needs == Needs::Calibration;
         let folder_options = FolderOptions { fps: options.fps, ..FolderOptions::default() };
         match footage {
-            Footage::Folder(root) if needs_calibration => Self::open_folder(root, footage, options, folder_options),
+            Footage::Folder(root) | Footage::VideoFolder(root) if needs_calibration => {
+                Self::open_folder(root, footage, options, folder_options)
+            }
             Footage::Recording(path) => {
                 let cameras = recorded_cameras(path)?;
                 cameras.log_notes(path);
@@ -95,7 +97,7 @@ impl Take {
                 "{} is no configuration, recording or folder; name several videos, or one of these",
                 files.first().map_or_else(String::new, |file| file.display().to_string())
             ),
-            Footage::Folder(_) | Footage::Videos(_) => {
+            Footage::Folder(_) | Footage::VideoFolder(_) | Footage::Videos(_) => {
                 Ok(Self::from_sources(ready(footage.open(None, &folder_options)?.sources)))
             }
         }
@@ -114,6 +116,7 @@ impl Take {
         let mut sources = footage.open(None, &folder_options)?.sources;
         let masks = root.join("mask");
         let given_masks = (is_calibrated || options.calibration.is_some())
+            && matches!(footage, Footage::Folder(_))
             && sources.iter().all(|source| masks.join(source.camera().as_str()).is_dir());
         if given_masks {
             sources = footage.open(None, &FolderOptions { with_masks: true, ..folder_options })?.sources;

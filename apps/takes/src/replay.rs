@@ -1,13 +1,17 @@
 //! Replay of stored footage into a session: for `flyrig eval`, training and benchmarks.
 
-use std::{collections::BTreeMap, ops::Range, path::PathBuf};
+use std::{
+    collections::BTreeMap,
+    ops::Range,
+    path::{Path, PathBuf},
+};
 
 use anyhow::{Context, Result, bail};
 use flyrig_body::{Outfit, ShapeParams, default_template, load_gltf};
-use flyrig_capture::{RecordedCamera, recorded_spans};
+use flyrig_capture::{CaptureErrorKind, RecordedCamera, VideoOptions, VideoReplay, recorded_spans};
 use flyrig_fusion::{
     EstimatedPerception, GivenPerception, GivenPerson, Origin, PerceptionSettings, PersonId, SHAPE_SECS, SHAPE_SETS,
-    Session, SessionBuilder, SessionSettings,
+    Session, SessionBuilder, SessionSettings, next_frame,
 };
 use flyrig_gpu::GpuContext;
 use flyrig_sync::SyncSettings;
@@ -103,6 +107,7 @@ impl Replay {
         let lags_nanos = sync.with_offsets_of(&rig.cameras).with_offsets_of(&holdout).lags_nanos;
         let recorded = match &footage {
             Footage::Recording(_) => Some(measure_recording(settings, &rig)?),
+            Footage::VideoFolder(root) => Some(measure_videos(root, settings)?),
             Footage::Folder(_) | Footage::Videos(_) => None,
         };
         let fps = recorded.map_or(settings.fps, |(fps, _)| fps);
@@ -251,6 +256,40 @@ fn measure_recording(settings: &ReplaySettings, rig: &Rig) -> Result<(f64, usize
         bail!("no frame of {path} is in {start}..{end}; there are frames 0 to {}", frames - 1);
     }
     Ok((longest.fps().unwrap_or(settings.fps), (frames.min(end) - start) as usize))
+}
+
+/// Returns the frame rate of a folder's videos, frames per second, and the number of their frames in the chosen range.
+fn measure_videos(root: &Path, settings: &ReplaySettings) -> Result<(f64, usize)> {
+    if settings.session.perception.masks == Origin::Given {
+        bail!("the videos in {} have no masks; add --masks estimated", root.display());
+    }
+    let measure = |name: &String| {
+        let id = CameraId::from(name.as_str());
+        let video = VideoReplay::open(&id, &dataset::video_file(root, &id), &VideoOptions::default())?;
+        video.header_rate().map_or_else(|| count_frames(video, settings.fps), Ok)
+    };
+    let rates = settings.inputs.iter().map(measure).collect::<Result<Vec<_>>>()?;
+    let (fps, frames) = rates.into_iter().max_by_key(|(_, frames)| *frames).unwrap_or((settings.fps, 0));
+    let Range { start, end } = settings.frames.clone().unwrap_or(0..u64::MAX);
+    if start >= frames {
+        bail!("no frame of {} is in {start}..{end}; there are frames 0 to {}", root.display(), frames.max(1) - 1);
+    }
+    Ok((fps, frames.min(end).saturating_sub(start) as usize))
+}
+
+/// Counts the frames of a video whose header states none; returns their rate, per second, with them: `fps` for fewer than two.
+fn count_frames(mut video: VideoReplay, fps: f64) -> Result<(f64, u64)> {
+    let (mut frames, mut last_nanos) = (0u64, 0);
+    loop {
+        match next_frame(&mut video) {
+            Ok(Some(frame)) => (frames, last_nanos) = (frames + 1, frame.capture_nanos),
+            Ok(None) => break,
+            Err(error) if error.kind == CaptureErrorKind::Corrupt => {}
+            Err(error) => return Err(error.into()),
+        }
+    }
+    let rate = frames.saturating_sub(1) as f64 / (last_nanos as f64 * 1e-9);
+    Ok((if rate.is_finite() && rate > 0.0 { rate } else { fps }, frames))
 }
 
 /// Loads the person of the data set's glTF file.

@@ -1,8 +1,9 @@
 //! Qualisys Track Manager: the calibration as XML (`*.qca.txt`, or the XML of its real-time protocol).
 //!
 //! `transform` is the position in millimetres and the rotation world to camera, row by row, with camera axes x right, y
-//! up, z backward. Image lengths are 64ths of a pixel, measured from the image's edge (`sensorMaxU` of an image of 1920
-//! pixels is 122879): half a pixel is subtracted from the principal point. Distortion coefficients are OpenCV's.
+//! up, z backward. Image lengths are 64ths of a pixel, measured from the image's edge: half a pixel is subtracted from the principal
+//! point. `sensorMaxU` of an image of 1920 pixels is 122879, the last 64th of its last pixel, or 122816, the first one, by version.
+//! Distortion coefficients are OpenCV's.
 
 use std::{fmt::Write as _, path::Path};
 
@@ -75,11 +76,11 @@ fn camera(id: &str, node: Node<'_, '_>) -> Result<ImportedCamera, String> {
     }
     let of_lens = |key: &str| number(&intrinsic, key);
     let pixels = |key: &str| Ok::<f64, String>(of_lens(key)? / SUBPIXELS);
-    let side = |low: &str, high: &str| Ok::<f64, String>((of_lens(high)? - of_lens(low)? + 1.0) / SUBPIXELS);
+    let side = |low: &str, high: &str| Ok::<f64, String>(pixels(high)?.floor() - pixels(low)?.floor() + 1.0);
     let sensor = [side("sensorMinU", "sensorMaxU")?, side("sensorMinV", "sensorMaxV")?];
     if sensor.iter().any(|side| *side < LEAST_SIDE) {
         return Err(format!(
-            "sensorMaxU and sensorMaxV make a sensor of {:.1}x{:.1} pixels; lengths are not in 64ths of a pixel, export it again",
+            "sensorMaxU and sensorMaxV make a sensor of {}x{} pixels; lengths are not in 64ths of a pixel, export it again",
             sensor[0], sensor[1]
         ));
     }

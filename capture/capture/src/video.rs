@@ -151,6 +151,20 @@ impl VideoReplay {
         self.header_size
     }
 
+    /// Returns the duration by the file's header, seconds, where it states one.
+    #[must_use]
+    pub fn header_secs(&self) -> Option<f64> {
+        let nanos = self.demuxer.streams().get(self.stream)?.duration().as_nanos()?;
+        Some(nanos as f64 * 1e-9).filter(|secs| *secs > 0.0)
+    }
+
+    /// Returns frames per second and the number of frames by the file's header, where it states both. Decoding may find others.
+    #[must_use]
+    pub fn header_rate(&self) -> Option<(f64, u64)> {
+        let frames = self.demuxer.streams().get(self.stream)?.frames().filter(|frames| *frames > 0)?;
+        Some((frames as f64 / self.header_secs()?, frames)).filter(|(fps, _)| (0.1..=10_000.0).contains(fps))
+    }
+
     fn error(&self, kind: CaptureErrorKind, text: impl fmt::Display) -> CaptureError {
         CaptureError::new(&self.camera, kind, format!("{}: {text}", self.path.display()))
     }

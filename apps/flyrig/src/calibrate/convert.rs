@@ -5,9 +5,9 @@ use std::path::{Path, PathBuf};
 use anyhow::{Context as _, Result, bail, ensure};
 use clap::Args;
 use flyrig_calib::{Format, save_lenses};
-use flyrig_capture::folder_image_size;
+use flyrig_capture::{FolderOptions, folder_image_size};
 use flyrig_fusion::Upright;
-use flyrig_takes::person_up;
+use flyrig_takes::{Footage, person_up};
 use flyrig_types::{Camera, ColorMatch, Rig};
 use glam::DVec3;
 
@@ -47,7 +47,11 @@ fn parse_format(text: &str) -> Result<Format, String> {
         .ok_or_else(|| format!("no such format; known: {}", known.join(", ")))
 }
 
-fn parse_scale(text: &str) -> Result<f64, String> {
+/// Parses metres of a unit.
+///
+/// # Errors
+/// Names the range.
+pub fn parse_scale(text: &str) -> Result<f64, String> {
     let scale = text.parse().ok().filter(|scale| (1e-9..=1e9).contains(scale));
     scale.ok_or_else(|| "expected metres of a unit, between 1e-9 and 1e9".to_owned())
 }
@@ -120,7 +124,10 @@ pub fn convert(args: &CalibrateConvertArgs) -> Result<()> {
 /// Checks the up direction against the person in the images, where there are some: takes it from them where the file does not state
 /// it, and warns where they contradict the file.
 fn check_up(rig: &mut Rig, is_stated: bool, images: &Path) {
-    let person = if images.join("images").is_dir() { person_up(rig, images) } else { Ok(Upright::default()) };
+    let footage = Footage::from_dataset(images);
+    let has_images = images.join("images").is_dir() || matches!(footage, Footage::VideoFolder(_));
+    let person =
+        if has_images { person_up(rig, &footage, FolderOptions::default().fps) } else { Ok(Upright::default()) };
     let person = person.unwrap_or_else(|error| {
         eprintln!("warning: up is not checked against the person in {}: {error:#}", images.display());
         Upright::default()

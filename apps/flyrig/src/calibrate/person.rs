@@ -2,17 +2,11 @@
 
 use anyhow::{Context as _, Result, ensure};
 use clap::Args;
-use flyrig_body::{ShapeParams, default_template};
-use flyrig_calib::{
-    Deviation, OutlineCorner, PersonCamera, PersonFit, PersonOptions, PersonTracks, calibrate_person, save_calibration,
-};
+use flyrig_calib::{Deviation, PersonCamera, PersonFit, PersonOptions, PersonTracks, save_calibration};
 use flyrig_gpu::GpuContext;
 use flyrig_report::{stop, write_whole};
-use flyrig_sync::{HullCorner, silhouette_hull};
-use flyrig_takes::{Calibration, Take, TakeSpan};
-use flyrig_tracker::{PoseConfig, PoseNet, Viewers};
+use flyrig_takes::{Calibration, PersonFinder, Take, TakeSpan, ensure_same_person, fit_person};
 use flyrig_types::{Camera, Image, Rig};
-use glam::DVec2;
 use serde_json::json;
 
 use super::output::{FILES, refuse_existing};
@@ -30,33 +24,6 @@ pub struct CalibratePersonArgs {
     pub target: TargetArgs,
 }
 
-/// Indices of the landmarks in use in the network's output: nose, eyes, ears, shoulders to wrists, index fingers, hips to toes.
-const LANDMARKS: [usize; 23] = [0, 2, 5, 7, 8, 11, 12, 13, 14, 15, 16, 19, 20, 23, 24, 25, 26, 27, 28, 29, 30, 31, 32];
-/// Pairs of landmarks at a constant distance.
-const LIMBS: [(usize, usize); 17] = [
-    (7, 8),
-    (0, 7),
-    (0, 8),
-    (2, 5),
-    (11, 12),
-    (11, 13),
-    (13, 15),
-    (12, 14),
-    (14, 16),
-    (23, 24),
-    (23, 25),
-    (25, 27),
-    (24, 26),
-    (26, 28),
-    (27, 29),
-    (28, 30),
-    (29, 31),
-];
-/// Groups of (left, right) landmarks that the network confuses together: face, arms, legs.
-const MIRRORED: [&[(usize, usize)]; 3] =
-    [&[(2, 5), (7, 8)], &[(11, 12), (13, 14), (15, 16), (19, 20)], &[(23, 24), (25, 26), (27, 28), (29, 30), (31, 32)]];
-/// Median reprojection error, as a fraction of the image's longer side, beyond which a camera shows another person.
-const MOST_ERROR: f64 = 0.02;
 /// Displacement of the person in a camera's image beyond which its pose was wrong, pixels, and as a multiple of the halves' difference.
 const LEAST_MOVED_PX: f64 = 2.0;
 const CLEARLY: f64 = 2.0;
@@ -65,8 +32,6 @@ const MOST_HALVES_PX: f64 = 4.0;
 /// Least reported time offset, and largest standard deviation of a useful one, seconds.
 const LEAST_LAG_S: f64 = 0.003;
 const MOST_LAG_SIGMA_S: f64 = 0.008;
-/// Least confidence of a landmark.
-const CONFIDENCE: f64 = 0.3;
 
 /// Runs the command.
 pub fn person(args: &CalibratePersonArgs, gpu: &dyn Fn() -> Result<GpuContext>) -> Result<()> {
@@ -84,22 +49,9 @@ pub fn person(args: &CalibratePersonArgs, gpu: &dyn Fn() -> Result<GpuContext>) 
     ensure!(rig.cameras.len() > 1, "one camera alone has nothing to agree with");
     let known_nanos = take.sync.lags_nanos.clone();
     let tracks = track_landmarks(args, &rig, plates, take)?;
-    let number = |landmark: usize| LANDMARKS.iter().position(|known| *known == landmark);
-    let numbers = |pairs: &[(usize, usize)]| -> Vec<(usize, usize)> {
-        pairs.iter().filter_map(|(a, b)| Some((number(*a)?, number(*b)?))).collect()
-    };
     let options = PersonOptions { lags: !args.no_offsets, ..PersonOptions::default() };
-    let fit = calibrate_person(&rig, &tracks, &numbers(&LIMBS), &MIRRORED.map(numbers), options)?;
-    for (camera, solved) in rig.cameras.iter().zip(&fit.cameras) {
-        let side = f64::from(camera.intrinsics.width.max(camera.intrinsics.height));
-        ensure!(
-            solved.error_px.1 < MOST_ERROR * side,
-            "camera {}: its landmarks are {:.0} px off those of the other cameras: one person alone may be in view, and the calibration \
-             must be roughly right",
-            camera.id,
-            solved.error_px.1
-        );
-    }
+    let fit = fit_person(&rig, &tracks, options)?;
+    ensure_same_person(&rig, &fit)?;
     print(&rig, &tracks, &fit);
     advise(&rig, &fit, options.lags);
     // The total of the already subtracted offset and the residual one.
@@ -133,40 +85,16 @@ fn track_landmarks(
     plates: Vec<Option<Image>>,
     take: Take,
 ) -> Result<PersonTracks> {
-    let template = default_template(&ShapeParams::default())?;
-    let mut viewers = Viewers::new(&PoseNet::embedded()?, &template, rig, plates, &PoseConfig::default())?;
-    let mut tracks = PersonTracks::new(rig.cameras.len(), LANDMARKS.len());
+    let mut finder = PersonFinder::new(std::slice::from_ref(rig), plates)?;
     let secs = [args.input.span.from_secs, args.input.span.from_secs + args.input.span.secs];
-    let errors = take.for_each_set(rig, TakeSpan { secs, spread_nanos: 0 }, "the person, ms of the take", |set| {
-        for (slot, found) in viewers.estimate(set)?.into_iter().enumerate() {
-            let (Some(found), Some(frame)) = (found, &set.frames[slot]) else { continue };
-            if let Some(mask) = found.masks.iter().flatten().next() {
-                let corner = |corner: HullCorner| OutlineCorner { ray: corner.ray, is_cut: corner.is_cut };
-                let hull = silhouette_hull(&rig.cameras[slot], mask).into_iter().map(corner).collect();
-                tracks.add_outline(slot, frame.capture_nanos, hull);
-            }
-            let Some(keypoints) = found.keypoints.into_iter().next().flatten() else { continue };
-            let seen: Vec<Option<(DVec2, f64)>> = LANDMARKS
-                .iter()
-                .map(|landmark| keypoints[*landmark])
-                .map(|point| {
-                    (point.usable() && point.confidence >= CONFIDENCE).then_some((point.pixel, point.confidence))
-                })
-                .collect();
-            tracks.add(slot, frame.capture_nanos, &seen);
-        }
-        Ok(())
-    })?;
+    let errors = take
+        .for_each_set(rig, TakeSpan { secs, spread_nanos: 0 }, "the person, ms of the take", |set| finder.add(set))?;
     for (slot, camera) in rig.cameras.iter().enumerate() {
         if let Some(error) = errors.get(slot) {
             eprintln!("warning: not every image of camera {} could be used; the last: {error}", camera.id);
         }
-        ensure!(
-            tracks.images(slot) > 0,
-            "camera {}: no person is seen; let one person move where all cameras see them whole",
-            camera.id
-        );
     }
+    let (_, tracks) = finder.into_tracks()?.pop().context("no calibration")?;
     Ok(tracks)
 }
 

@@ -1,0 +1,161 @@
+//! Check of a take's calibration by the person in it: time offsets, poses and colours.
+//!
+//! Each is measured on the person and adopted only where silhouettes and colours that were kept back agree better with it. The result
+//! lies in the take: `calibration.toml`, the old one beside it, and `calibration.check.json`, which says what was found.
+
+mod colors;
+mod files;
+mod geometry;
+mod instants;
+mod sentences;
+
+use std::path::Path;
+
+use anyhow::{Context as _, Result};
+use flyrig_gpu::GpuContext;
+use flyrig_sync::SyncSettings;
+use flyrig_types::{Image, Rig};
+use serde_json::json;
+
+pub use self::files::mark_checked;
+use self::{
+    colors::{ColorFinding, match_take},
+    files::{is_checked, save},
+    geometry::{Finding, measure},
+    instants::Instants,
+    sentences::sentences,
+};
+use crate::{
+    dataset,
+    footage::{Footage, OpenFootage},
+    open::{TakeInput, TakeOptions},
+    take::{Calibration, Take},
+};
+use flyrig_capture::FolderOptions;
+
+/// Footage whose calibration is checked.
+pub struct CheckInput<'a> {
+    /// Footage with images of all cameras.
+    pub footage: &'a Footage,
+    /// Frame rate of a folder of images, frames per second.
+    pub fps: f64,
+    /// Calibrations that are possible, at least one; the first is the take's own.
+    pub rigs: &'a [Rig],
+    /// Images of the empty scene, one per slot.
+    pub plates: Vec<Option<Image>>,
+}
+
+/// Result of a check.
+#[derive(Debug, Clone)]
+pub struct Checked {
+    /// Calibration with what was adopted.
+    pub rig: Rig,
+    /// Which of the possible calibrations fits best.
+    pub choice: usize,
+    /// Whether the calibration differs from the chosen one.
+    pub is_changed: bool,
+    /// What was wrong, for the user.
+    pub sentences: Vec<String>,
+    report: serde_json::Value,
+}
+
+impl Checked {
+    /// Writes the calibration into a take, the one that it replaces beside it.
+    ///
+    /// # Errors
+    /// Names the file that cannot be written.
+    pub fn save(&self, root: &Path) -> Result<()> {
+        save(root, self)
+    }
+}
+
+/// Checks the calibration of a take folder that was never checked, adopts what agrees better, and prints what was wrong. A folder that
+/// cannot be written, a single camera, and a person who tells nothing leave the calibration as it is, with a line that says so.
+///
+/// # Errors
+/// The calibration cannot be read.
+pub fn check_take(root: &Path, fps: f64, gpu: &dyn Fn() -> Result<GpuContext>) -> Result<()> {
+    let footage = Footage::from_dataset(root);
+    let Some(root) = footage.folder() else { return Ok(()) };
+    let OpenFootage { sources, .. } = footage.open(None, &FolderOptions { fps, ..FolderOptions::default() })?;
+    let cameras: Vec<_> = sources.iter().map(|source| source.camera().clone()).collect();
+    drop(sources);
+    let all = footage.load_rig(&cameras)?;
+    let names: Vec<String> = all.cameras.iter().map(|camera| camera.id.to_string()).collect();
+    let with_images: Vec<String> = names.into_iter().filter(|name| cameras.contains(&name.as_str().into())).collect();
+    let rig = dataset::select_cameras(&all, &with_images, "the calibration")?;
+    if rig.cameras.len() < 2 || with_images.is_empty() || is_checked(root, &all)? {
+        return Ok(());
+    }
+    if let Err(error) = files::ensure_writable(root) {
+        eprintln!("the calibration is used as it is, since nothing can be written beside it ({error})");
+        return Ok(());
+    }
+    eprintln!("checking the calibration by the person in the take, once (--trust-calibration leaves it alone)");
+    let plates = dataset::load_plates(&root.join("background"), &rig)?;
+    let input = CheckInput { footage: &footage, fps, rigs: std::slice::from_ref(&rig), plates };
+    match check(input, gpu) {
+        Ok(mut checked) => {
+            checked.sentences.iter().for_each(|sentence| eprintln!("{sentence}"));
+            // Cameras without images stay.
+            let kept = all.cameras.iter().map(|camera| {
+                let found = checked.rig.cameras.iter().find(|other| other.id == camera.id);
+                found.unwrap_or(camera).clone()
+            });
+            checked.rig = Rig { cameras: kept.collect(), world_up: all.world_up };
+            checked.save(root)
+        }
+        Err(error) => {
+            eprintln!("the calibration could not be checked and is used as it is: {error:#}");
+            mark_checked(root)
+        }
+    }
+}
+
+/// Measures time offsets, poses and colours from the person in a take.
+///
+/// # Errors
+/// No person is seen, or the cameras see different ones; the take cannot be read.
+pub fn check(input: CheckInput<'_>, gpu: &dyn Fn() -> Result<GpuContext>) -> Result<Checked> {
+    let CheckInput { footage, fps, rigs, plates } = input;
+    let first = rigs.first().context("no calibration")?;
+    let cameras: Vec<_> = first.cameras.iter().map(|camera| camera.id.clone()).collect();
+    let options = FolderOptions { fps, ..FolderOptions::default() };
+    let secs = footage.open(Some(&cameras), &options)?.secs;
+    let instants = Instants::spread(secs, cameras.len());
+    let open = |rig: &Rig| -> Result<Take> {
+        let take =
+            Take::open(&TakeInput::Footage(footage.clone()), &TakeOptions { fps, ..TakeOptions::default() }, &|| {
+                anyhow::bail!("a take needs no adapter")
+            })?;
+        let sources = take.sources.into_iter().filter(|source| cameras.contains(source.camera())).collect();
+        Ok(Take {
+            sources,
+            calibration: Some(Calibration::without_plates(rig.clone())),
+            sync: SyncSettings::default().with_offsets_of(&rig.cameras),
+            ..Take { sources: Vec::new(), ..take }
+        })
+    };
+    let finding = measure(rigs, copies(&plates)?, open(first)?, &instants)?;
+    let colors = match_take(&finding.rig, &plates, &|| open(&finding.rig), gpu()?).unwrap_or_else(|error| {
+        tracing::debug!(%error, "the colours could not be matched");
+        ColorFinding::none(&finding.rig)
+    });
+    let mut rig = finding.rig.clone();
+    if colors.is_adopted {
+        for (camera, color) in rig.cameras.iter_mut().zip(&colors.colors) {
+            camera.color = *color;
+        }
+    }
+    rig.validate().context("the calibration that the person tells")?;
+    let sentences = sentences(&rigs[finding.choice], &finding, &colors);
+    let report = json!({ "geometry": finding.report(), "colors": colors.report(&rig) });
+    let is_changed = colors.is_adopted || finding.adopts_lags || finding.adopts_poses;
+    Ok(Checked { rig, choice: finding.choice, is_changed, sentences, report })
+}
+
+/// Copies plates, whose bytes are pooled and cannot be shared.
+fn copies(plates: &[Option<Image>]) -> Result<Vec<Option<Image>>> {
+    let copy = |image: &Image| Image::new(image.width(), image.height(), image.format(), image.bytes().to_vec());
+    Ok(plates.iter().map(|plate| plate.as_ref().map(copy).transpose()).collect::<Result<_, _>>()?)
+}
