@@ -149,7 +149,8 @@ pub fn calibrate_person(
         return Err(CalibError::PersonStill { extent_mm: 1e3 * extent_m });
     }
     let part = |from, to| solve(rig, &tracks.part(from, to), limbs, options, Some(&whole.estimate));
-    let halves = part(0.0, 0.5).zip(part(0.5, 1.0));
+    let (first, second) = rayon::join(|| part(0.0, 0.5), || part(0.5, 1.0));
+    let halves = first.zip(second);
     let kept_back = halves.as_ref().and_then(|(first, second)| kept_back(rig, &tracks, [first, second]));
     let before = motions(rig);
     let cameras = (0..rig.cameras.len())

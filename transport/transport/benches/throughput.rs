@@ -23,19 +23,17 @@ type Failure = Box<dyn std::error::Error>;
 
 fn main() -> Result<(), Failure> {
     let arguments: Vec<String> = std::env::args().skip(1).filter(|argument| argument != "--bench").collect();
-    if let [word, endpoint, shared_memory, seconds] = arguments.as_slice()
+    if let [word, endpoint, seconds] = arguments.as_slice()
         && word == "watch"
     {
         let seconds = flyrig_types::saturating_secs(seconds.parse()?);
-        return watch(endpoint, shared_memory == "true", seconds);
+        return watch(endpoint, seconds);
     }
     let seconds: f64 = arguments.first().map_or(Ok(3.0), |seconds| seconds.parse())?;
     codec()?;
-    println!("\nload            shm  publish us p50/p99  latency ms p50/p99/max  MiB/s  per sec.  missed");
-    for shared_memory in [true, false] {
-        for load in [Load::Views, Load::Splats, Load::FastViews, Load::FastSplats] {
-            measure(load, shared_memory, seconds)?;
-        }
+    println!("\nload            publish us p50/p99  latency ms p50/p99/max  MiB/s  per sec.  missed");
+    for load in [Load::Views, Load::Splats, Load::FastViews, Load::FastSplats] {
+        measure(load, seconds)?;
     }
     Ok(())
 }
@@ -84,15 +82,14 @@ fn codec() -> Result<(), SplatError> {
     Ok(())
 }
 
-fn measure(load: Load, shared_memory: bool, seconds: f64) -> Result<(), Failure> {
+fn measure(load: Load, seconds: f64) -> Result<(), Failure> {
     let config = TransportConfig {
         listen: vec!["tcp/127.0.0.1:0".to_owned()],
-        shared_memory,
         ..TransportConfig::publisher("bench")
     };
     let publisher = Publisher::open(&config)?;
     let mut child = Command::new(std::env::current_exe()?)
-        .args(["watch", &publisher.endpoints()[0], &shared_memory.to_string(), &seconds.to_string()])
+        .args(["watch", &publisher.endpoints()[0], &seconds.to_string()])
         .stdout(Stdio::piped())
         .spawn()?;
     VIEWS.iter().try_for_each(|view| publisher.add_view(view))?;
@@ -146,15 +143,15 @@ fn measure(load: Load, shared_memory: bool, seconds: f64) -> Result<(), Failure>
     }
     child.wait()?;
     let (p50, p99) = (percentile(&mut micros, 0.5), percentile(&mut micros, 0.99));
-    println!("{:<14} {shared_memory:>5}  {p50:>9.1} / {p99:>6.1}   {}", format!("{load:?}"), line.trim());
+    println!("{:<14} {p50:>9.1} / {p99:>6.1}   {}", format!("{load:?}"), line.trim());
     publisher.close()?;
     Ok(())
 }
 
 /// Receives in the second process for a while and prints the figures of all topics together.
-fn watch(endpoint: &str, shared_memory: bool, seconds: Duration) -> Result<(), Failure> {
+fn watch(endpoint: &str, seconds: Duration) -> Result<(), Failure> {
     let config =
-        TransportConfig { connect: vec![endpoint.to_owned()], shared_memory, ..TransportConfig::subscriber("bench") };
+        TransportConfig { connect: vec![endpoint.to_owned()], ..TransportConfig::subscriber("bench") };
     let subscriber = Subscriber::open(&config, &Interests { views: Views::All, splats: true, ..Interests::default() })?;
     let mut millis = Vec::new();
     let mut first = None;

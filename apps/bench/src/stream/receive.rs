@@ -172,8 +172,6 @@ pub fn receive(args: &BenchReceiveArgs, gpu: &GpuContext) -> Result<()> {
         Some(path) => TransportConfig::with_key(KeyFile::read(path, &[Role::Viewer, Role::Relay])?),
         None => TransportConfig { connect: vec![args.connect.clone()], ..TransportConfig::subscriber(&args.rig) },
     };
-    // With a take both ends are on one computer: shared memory would bypass the line.
-    let config = TransportConfig { shared_memory: known.is_none(), ..config };
     let start = Instant::now();
     let subscriber = Subscriber::open(&config, &Interests { people: true, stats: true, ..Interests::default() })?;
     // Rendering must not delay messages: only the newest message of a topic waits.

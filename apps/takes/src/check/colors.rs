@@ -19,8 +19,6 @@ const INTERVAL_S: f64 = 0.125;
 const PAYS: f64 = 0.9;
 /// Least relative change of a gain for which colours are adopted.
 const LEAST_GAIN: f64 = 0.03;
-/// Largest relative difference between the gains of the halves of a take.
-const MOST_HALVES: f64 = 0.06;
 
 /// What the person tells of colours.
 pub(super) struct ColorFinding {
@@ -88,8 +86,7 @@ pub(super) fn match_take(
     let changes = |(old, new): (&ColorMatch, &CameraColors)| {
         (0..3).any(|k| (new.color.gain[k] / old.gain[k] - 1.0).abs() > LEAST_GAIN)
     };
-    let is_steady = fit.cameras.iter().all(|camera| camera.halves < MOST_HALVES);
-    let is_adopted = is_steady && fit.kept_back < PAYS * before && old.iter().zip(&fit.cameras).any(changes);
+    let is_adopted = fit.kept_back < PAYS * before && old.iter().zip(&fit.cameras).any(changes);
     let colors: Vec<ColorMatch> = fit.cameras.iter().map(|camera| camera.color).collect();
     let matched = Rig {
         cameras: raw

@@ -3,6 +3,7 @@
 use anyhow::{Context as _, Result, bail};
 use flyrig_calib::{Agreement, PersonCamera, PersonFit, PersonOptions, PersonTracks};
 use flyrig_types::{Image, Rig};
+use rayon::prelude::*;
 use serde_json::{Value, json};
 
 use super::Instants;
@@ -78,8 +79,8 @@ pub(super) fn measure(rigs: &[Rig], plates: Vec<Option<Image>>, take: Take, inst
     })?;
     tracing::debug!(seconds = started.elapsed().as_secs_f64(), "found the person");
     let tracked = finder.into_tracks()?;
-    let fits = tracked.iter().map(|(rig, tracks)| fit_person(rig, tracks, PersonOptions::default()));
-    let fits = fits.collect::<Result<Vec<PersonFit>, _>>()?;
+    let fit = |(rig, tracks): &(Rig, PersonTracks)| fit_person(rig, tracks, PersonOptions::default());
+    let fits = tracked.par_iter().map(fit).collect::<Result<Vec<PersonFit>, _>>()?;
     let after = |fit: &PersonFit| fit.planes_rad.map_or(f64::INFINITY, |(_, after)| after);
     let Some((choice, fit)) = fits.into_iter().enumerate().min_by(|(_, a), (_, b)| after(a).total_cmp(&after(b)))
     else {

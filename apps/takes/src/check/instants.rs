@@ -1,7 +1,7 @@
 //! Frame sets that a check looks at: few enough for a minute on two cores.
 
 /// Images that are looked at, over all cameras.
-const MOST_IMAGES: f64 = 320.0;
+const MOST_IMAGES: f64 = 240.0;
 /// Least and most footage that is looked at, seconds.
 const LOOKED_S: (f64, f64) = (1.0, 3.0);
 /// Frame sets per second: faster footage is thinned.

@@ -39,8 +39,9 @@ pub struct TransportConfig {
     pub connect: Vec<String>,
     /// Whether rigs and viewers find each other by UDP multicast on the local network.
     pub multicast: bool,
-    /// Whether large payloads pass through shared memory between processes of one host.
-    pub shared_memory: bool,
+    /// Ignored; configurations of earlier versions have it. zenoh never unmaps the shared memory of processes that are gone.
+    #[serde(rename = "shared_memory", skip_serializing)]
+    pub _shared_memory: Option<bool>,
     /// Publisher: largest number of subscribers with a viewpoint of their own.
     pub max_viewers: usize,
     /// Publisher: lifetime of a viewpoint that is not renewed, milliseconds. Not part of a configuration.
@@ -86,7 +87,7 @@ impl Default for TransportConfig {
             listen: vec![DEFAULT_ENDPOINT.to_owned()],
             connect: vec![],
             multicast: false,
-            shared_memory: true,
+            _shared_memory: None,
             max_viewers: 4,
             viewpoint_lease_millis: 3000,
             viewpoint_pixels_per_second: 512 * 512 * 30 * 4,
@@ -219,8 +220,6 @@ impl TransportConfig {
             ("scouting/multicast/enabled", self.multicast.to_string()),
             // Gossip would connect the viewers of one rig to each other for nothing.
             ("scouting/gossip/enabled", self.multicast.to_string()),
-            // A holder of a key is on another computer.
-            ("transport/shared_memory/enabled", (self.shared_memory && self.key.is_none()).to_string()),
             // zenoh's 2 batches of 64 KiB overflow when several images leave at once; 8 hold two frames of four views.
             ("transport/link/tx/queue/size/data", "8".to_owned()),
             // Chunks of a template that are queried at once: one that finds no room is missing for seconds.

@@ -89,7 +89,7 @@ fn a_large_template_comes_whole_with_one_network_thread() {
         assert!(inside.unwrap().success());
         return;
     }
-    let publisher = open_publisher(|config| config.shared_memory = false);
+    let publisher = open_publisher(|_| {});
     let subscriber = open_subscriber(&publisher, &people());
     wait_until("the subscription", || publisher.has_person_subscribers());
     let bytes: Vec<u8> = (0..1_500_000u32).map(|i| (i.wrapping_mul(2_654_435_761) >> 24) as u8).collect();
