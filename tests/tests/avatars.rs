@@ -119,10 +119,11 @@ fn an_avatar_is_built_scored_driven_and_exported() {
     refused(&["info", "nowhere.flyavatar"], "nowhere.flyavatar: No such file");
     refused(&["render", "a.flyavatar", "--motion", "a.png", "--out", "r"], "a.png is neither BVH nor glTF");
     refused(&["render", "a.flyavatar", "--motion", "wlk", "--out", "r"], "one of still, turn, walk, wave, squat,");
-    let past =
-        |more: &[&str]| refused(&[more, &["a.flyavatar", "--motion", &motion]].concat(), "subject.glb has 6 frames");
-    past(&["render", "--out", "past", "--frames", "3..7"]);
-    past(&["export", "--out", "past.ply", "--frame", "6"]);
+    let past = |more: &[&str]| {
+        refused(&[more, &["a.flyavatar", "--motion", &motion]].concat(), "frame 899 is past the end: ");
+    };
+    past(&["render", "--out", "past", "--frames", "3..900"]);
+    past(&["export", "--out", "past.ply", "--frame", "899"]);
     assert!(!folder.path().join("past").exists() && !folder.path().join("past.ply").exists());
     refused(
         &["render", "a.flyavatar", "--motion", "walk", "--out", "a.mov"],

@@ -135,6 +135,12 @@ fn a_printed_board_calibrates_lenses_and_rig() {
     assert!(!folder.path().join("none").exists());
 }
 
+/// Returns the number of boards that a camera shares with the camera of a column of the page's first table.
+fn shares(page: &str, camera: &str, column: usize) -> u32 {
+    let row = page.split(&format!("<tr><td>{camera}<td>")).nth(1).unwrap().split("<tr>").next().unwrap();
+    row.split("</table>").next().unwrap().split("<td>").nth(column).unwrap().parse().unwrap()
+}
+
 #[test]
 fn cameras_that_no_board_joins_get_their_lenses_and_a_page_that_shows_who_shares_boards() {
     let folder = tempfile::tempdir().unwrap();
@@ -170,9 +176,12 @@ fn cameras_that_no_board_joins_get_their_lenses_and_a_page_that_shows_who_shares
     assert!(!at("cal/calibration.toml").exists(), "a calibration without poses");
     let shown = page("cal/calibration.html");
     assert!(shown.contains(groups) && !shown.contains("NaN") && !shown.contains("http-equiv"), "{shown:.3000}");
-    for row in ["<td>left<td><td>26<td>0", "<td>middle<td>26<td><td>0", "<td>right<td>0<td>0<td>"] {
-        assert!(shown.contains(row), "{row} is not in {shown:.3000}");
-    }
+    assert!(
+        shares(&shown, "left", 1) >= 8 && shares(&shown, "left", 1) == shares(&shown, "middle", 0),
+        "{shown:.3000}"
+    );
+    let with_right = [("left", 2), ("middle", 2), ("right", 0), ("right", 1)];
+    assert!(with_right.iter().all(|(camera, other)| shares(&shown, camera, *other) == 0), "{shown:.3000}");
 
     // With those lenses and the missing boards the same folder gets its calibration.
     let joined = command("calibrate rig together --lenses cal/lenses --out cal");
@@ -191,14 +200,10 @@ fn cameras_that_no_board_joins_get_their_lenses_and_a_page_that_shows_who_shares
     // A camera that never saw the board: the lenses of the others are kept. Given lenses are not written again.
     let none = vec![None; BOARDS as usize];
     write_images(&at("together"), &board, &cameras[2], &none);
-    let unseen = command("calibrate rig together --every-ms 100 --out unseen");
-    let stdout = failed(
-        unseen,
-        &["camera right: no board in its 9 images", "unseen/lenses holds the lenses of the other cameras"],
-    );
-    assert!(stdout.contains("looked at 9 of 26 frame sets, one per 100 ms (--every-ms)"), "{stdout}");
+    let unseen = command("calibrate rig together --out unseen");
+    failed(unseen, &["camera right: no board in its 26 images", "unseen/lenses holds the lenses of the other cameras"]);
     assert_lenses(&at("unseen/lenses"), &["left", "middle"]);
-    assert!(page("unseen/calibration.html").contains("<td>left<td><td>9<td>0"));
+    assert!(shares(&page("unseen/calibration.html"), "left", 1) >= 8);
     failed(command("calibrate rig together --lenses cal/lenses --out given"), &[groups, "given/calibration.html"]);
     assert!(at("given/calibration.html").exists() && !at("given/lenses").exists());
 }

@@ -2,8 +2,9 @@
 
 use std::f64::consts::TAU;
 
-use flyrig_types::{Camera, RenderedView};
-use glam::{DVec2, DVec3, Vec3};
+use flyrig_body::{BodyError, SurfaceGaussians, Template, sample_surface, skin_point_f64};
+use flyrig_types::{Camera, Pose, RenderedView};
+use glam::{DVec2, DVec3};
 use image::RgbImage;
 use rayon::prelude::*;
 
@@ -18,33 +19,47 @@ const LINE: f64 = 0.93;
 const AROUND_M: f64 = 0.9;
 const SOLID: f64 = 0.6;
 /// Side of a cell of the shadow, metres.
-const CELL_M: f64 = 0.025;
+const CELL_M: f64 = 0.015;
 /// Height up to which the surface casts a shadow, metres.
-const HIGHEST_M: f64 = 0.6;
+const HIGHEST_M: f64 = 0.4;
 /// Standard deviation of a point's shadow on the floor, and its growth with height, metres.
-const SHARP_M: f64 = 0.03;
-const SPREAD: f64 = 0.45;
-/// Largest number of points of the surface that cast a shadow.
-const MOST_POINTS: usize = 2500;
+const SHARP_M: f64 = 0.018;
+const SPREAD: f64 = 0.4;
+/// Number of points of the surface, 16 mm apart on an adult, that cast a shadow.
+const POINTS: usize = 8000;
 /// Largest darkening by the shadow, 0..=1.
-const DARKEST: f64 = 0.7;
+const DARKEST: f64 = 0.65;
 
-/// Floor at z = 0, a disc.
-#[derive(Debug, Clone, Copy)]
+/// Floor at z = 0, a disc, and the surface that casts a shadow on it.
 pub(super) struct Floor {
-    pub middle: DVec2,
+    middle: DVec2,
     radius_m: f64,
+    body: Template,
+    /// Points of the body's surface, evenly spaced, and the area of each.
+    points: SurfaceGaussians,
+    each_m2: f64,
 }
 
 impl Floor {
     /// Returns a floor on which everything within `reach_m` of the middle stands.
-    pub fn new(middle: DVec2, reach_m: f64) -> Self {
-        Self { middle, radius_m: reach_m + AROUND_M }
+    ///
+    /// # Errors
+    /// The body has no surface.
+    pub fn new(middle: DVec2, reach_m: f64, body: Template) -> Result<Self, BodyError> {
+        let points = sample_surface(&body, POINTS, 1)?;
+        let each_m2 = body.area_m2() / POINTS as f64;
+        Ok(Self { middle, radius_m: reach_m + AROUND_M, body, points, each_m2 })
     }
 
-    /// Paints a view over the backdrop. `surface` are points of the person's surface of `area_m2`; world, metres.
-    pub fn paint(&self, camera: &Camera, view: &RenderedView, surface: &[Vec3], area_m2: f64) -> RgbImage {
-        let shadow = Shadow::new(surface, area_m2);
+    /// Paints a view of the body in a pose over the backdrop.
+    pub fn paint(&self, camera: &Camera, view: &RenderedView, pose: &Pose) -> RgbImage {
+        let matrices = self.body.skeleton.world_from_canonical(pose);
+        let points = self.points.positions.iter().zip(&self.points.skin);
+        let points = points.map(|(place, skin)| skin_point_f64(&matrices, skin, place.as_dvec3())).collect();
+        self.paint_over(camera, view, &Shadow::new(points, self.each_m2))
+    }
+
+    fn paint_over(&self, camera: &Camera, view: &RenderedView, shadow: &Shadow) -> RgbImage {
         let world_from_camera = camera.camera_from_world.inverse();
         let (eye, intrinsics) = (world_from_camera.translation, camera.intrinsics);
         let mut image = RgbImage::new(view.width, view.height);
@@ -54,7 +69,7 @@ impl Floor {
             for (column, (to, from)) in to.chunks_exact_mut(3).zip(from.chunks_exact(4)).enumerate() {
                 let ideal = (DVec2::new(column as f64, row as f64) - intrinsics.center_px) / intrinsics.focal_px;
                 let ray = world_from_camera.rotation * ideal.extend(1.0);
-                let behind = self.brightness(eye, ray, intrinsics.focal_px.x, &shadow);
+                let behind = self.brightness(eye, ray, intrinsics.focal_px.x, shadow);
                 let alpha = f64::from(from[3]) / 255.0;
                 for (to, from) in to.iter_mut().zip(from) {
                     *to = (alpha * f64::from(*from) + (1.0 - alpha) * behind).round() as u8;
@@ -101,10 +116,9 @@ struct Shadow {
 }
 
 impl Shadow {
-    fn new(surface: &[Vec3], area_m2: f64) -> Self {
-        let step = surface.len().div_ceil(MOST_POINTS).max(1);
-        let casts = |place: &DVec3| place.is_finite() && place.z < HIGHEST_M;
-        let points: Vec<DVec3> = surface.iter().step_by(step).map(|place| place.as_dvec3()).filter(casts).collect();
+    /// Returns the shadow of points of `each_m2` each; world, metres.
+    fn new(mut points: Vec<DVec3>, each_m2: f64) -> Self {
+        points.retain(|place| place.is_finite() && place.z < HIGHEST_M);
         let bounds = |low: DVec2, high: DVec2, at: &DVec3| (low.min(at.truncate()), high.max(at.truncate()));
         let (low, high) = points.iter().fold((DVec2::INFINITY, DVec2::NEG_INFINITY), |(a, b), at| bounds(a, b, at));
         let size = high - low;
@@ -116,7 +130,6 @@ impl Shadow {
         let low = low - margin;
         let [columns, rows] = [size.x, size.y].map(|side| ((side + 2.0 * margin) / CELL_M).ceil() as usize + 1);
         let mut cells = vec![0.0; columns * rows];
-        let each_m2 = area_m2 / surface.len().div_ceil(step).max(1) as f64;
         for point in points {
             let height = point.z.max(0.0);
             let deviation = SHARP_M + SPREAD * height;
@@ -153,11 +166,16 @@ impl Shadow {
 
 #[cfg(test)]
 mod tests {
+    use flyrig_body::{ShapeParams, default_template};
     use flyrig_types::{Intrinsics, Isometry};
 
     use super::*;
 
     const SIZE: u32 = 120;
+
+    fn floor() -> Floor {
+        Floor::new(DVec2::ZERO, 1.0, default_template(&ShapeParams::default()).unwrap()).unwrap()
+    }
 
     fn camera(eye: DVec3) -> Camera {
         Camera::new(
@@ -177,37 +195,56 @@ mod tests {
         image.get_pixel(pixel.x as u32, pixel.y as u32).0[0]
     }
 
-    /// Returns the corners of a sole of 10 x 26 cm at a height, densely.
-    fn sole(height: f32) -> Vec<Vec3> {
-        (0..400).map(|i| Vec3::new((i % 20) as f32 * 0.005, (i / 20) as f32 * 0.013, height)).collect()
+    /// Returns points of a sole of 10 x 26 cm at a height, 0.65 cm2 each.
+    fn sole(height: f64) -> Vec<DVec3> {
+        (0..400).map(|i| DVec3::new(f64::from(i % 20) * 0.005, f64::from(i / 20) * 0.013, height)).collect()
     }
 
     #[test]
     fn a_shadow_is_below_what_stands_and_fades_with_its_height() {
-        let (floor, camera) = (Floor::new(DVec2::ZERO, 1.0), camera(DVec3::new(0.4, -3.0, 1.6)));
+        let (floor, camera) = (floor(), camera(DVec3::new(0.4, -3.0, 1.6)));
         let below = DVec3::new(0.05, 0.13, 0.0);
-        let darkness = |surface: &[Vec3]| {
-            let image = floor.paint(&camera, &empty(), surface, 0.05);
+        let darkness = |points: Vec<DVec3>| {
+            let image = floor.paint_over(&camera, &empty(), &Shadow::new(points, 6.5e-5));
             (seen(&image, &camera, below), seen(&image, &camera, DVec3::new(0.7, 0.13, 0.0)))
         };
-        let (bare, _) = darkness(&[]);
-        let heights = [0.0, 0.1, 0.3, 0.7].map(|height| darkness(&sole(height)));
+        let (bare, _) = darkness(Vec::new());
+        let heights = [0.0, 0.1, 0.2, 0.5].map(|height| darkness(sole(height)));
         assert!(heights.is_sorted_by_key(|(under, _)| *under), "{heights:?}");
-        assert!(heights[0].0 + 60 < bare && heights[3].0 == bare, "{heights:?} {bare}");
+        assert!(heights[0].0 + 50 < bare && heights[3].0 == bare, "{heights:?} {bare}");
         assert!(heights.iter().all(|(_, aside)| *aside + 8 > bare), "{heights:?}");
-        let poisoned = [sole(0.0), vec![Vec3::NAN, Vec3::INFINITY]].concat();
-        assert!(darkness(&poisoned).0.abs_diff(heights[0].0) < 3);
-        assert_eq!(darkness(&[Vec3::ZERO, Vec3::X * 1e30]).0, bare);
+        let poisoned = [sole(0.0), vec![DVec3::NAN, DVec3::INFINITY]].concat();
+        assert!(darkness(poisoned).0 == heights[0].0);
+        assert_eq!(darkness(vec![DVec3::ZERO, DVec3::X * 1e30]).0, bare);
+    }
+
+    #[test]
+    fn feet_darken_the_floor_where_they_stand_and_not_where_they_float() {
+        let (floor, camera) = (floor(), camera(DVec3::new(0.0, -3.0, 1.6)));
+        let mut pose = floor.body.skeleton.rest_pose();
+        let up = glam::DQuat::from_rotation_x(std::f64::consts::FRAC_PI_2);
+        pose.root_translation = up * pose.root_translation;
+        pose.joint_rotations[0] = up * pose.joint_rotations[0];
+        let origins = floor.body.skeleton.canonical_origins();
+        let foot = origins[floor.body.skeleton.joint("LeftFoot").unwrap()];
+        let below = DVec3::new(foot.x, -foot.z - 0.05, 0.0);
+        let darkness = |pose: &Pose| seen(&floor.paint(&camera, &empty(), pose), &camera, below);
+        let standing = darkness(&pose);
+        pose.root_translation.z += 0.3;
+        let floating = darkness(&pose);
+        assert!(standing + 40 < floating, "{standing} {floating}");
+        pose.root_translation = DVec3::NAN;
+        assert!(darkness(&pose) >= floating);
     }
 
     #[test]
     fn the_person_covers_the_backdrop_and_the_sky_is_wall() {
-        let floor = Floor::new(DVec2::ZERO, 1.0);
+        let (floor, shadow) = (floor(), |points| Shadow::new(points, 6.5e-5));
         let camera = camera(DVec3::new(0.0, -3.0, 1.0));
         let mut view = empty();
         view.rgba[..4].copy_from_slice(&[10, 200, 30, 255]);
         view.rgba[4..8].copy_from_slice(&[10, 200, 30, 128]);
-        let image = floor.paint(&camera, &view, &[], 1.0);
+        let image = floor.paint_over(&camera, &view, &shadow(Vec::new()));
         assert_eq!(image.get_pixel(0, 0).0, [10, 200, 30]);
         let half = image.get_pixel(1, 0).0;
         assert!(half[0].abs_diff(118) < 3 && half[1].abs_diff(213) < 3, "{half:?}");
@@ -215,8 +252,8 @@ mod tests {
         assert!(f64::from(seen(&image, &camera, DVec3::new(0.2, 0.2, 0.0))) < WALL - 10.0);
         // A camera in the floor, and an image of nothing.
         let level = Camera { camera_from_world: Isometry::look_at(DVec3::NEG_Y, DVec3::ZERO, DVec3::Z), ..camera };
-        assert!(floor.paint(&level, &empty(), &sole(0.0), 0.05).pixels().count() > 0);
+        assert_eq!(floor.paint_over(&level, &empty(), &shadow(sole(0.0))).dimensions(), (SIZE, SIZE));
         let nothing = RenderedView { width: 0, height: 0, rgba: Vec::new() };
-        assert_eq!(floor.paint(&level, &nothing, &[], 1.0).dimensions(), (0, 0));
+        assert_eq!(floor.paint_over(&level, &nothing, &shadow(Vec::new())).dimensions(), (0, 0));
     }
 }

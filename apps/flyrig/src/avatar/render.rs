@@ -8,7 +8,7 @@ use std::{
 use anyhow::{Context as _, Result, bail};
 use clap::Args;
 use flyrig_avatar::DetailedScene;
-use flyrig_body::{Template, skin_mesh};
+use flyrig_body::Template;
 use flyrig_gpu::GpuContext;
 use flyrig_report::{
     arguments::{parse_range, parse_size},
@@ -94,7 +94,7 @@ enum Output {
     /// Folder of images with a transparent background.
     Images(PathBuf),
     /// Video on a floor.
-    Video { file: VideoFile, floor: Floor, surface: Box<Template>, area_m2: f64 },
+    Video { file: VideoFile, floor: Box<Floor> },
 }
 
 impl Output {
@@ -103,10 +103,8 @@ impl Output {
         let ending = path.extension().map(|ending| ending.to_string_lossy().to_lowercase()).unwrap_or_default();
         match ending.as_str() {
             "mp4" | "avi" => Ok(Self::Video {
+                floor: Box::new(Floor::new(view.target.truncate(), view.reach_m, surface)?),
                 file: VideoFile::create(path, (width, height))?,
-                floor: Floor::new(view.target.truncate(), view.reach_m),
-                area_m2: surface.area_m2(),
-                surface: Box::new(surface),
             }),
             "mov" | "mkv" | "webm" | "m4v" | "png" | "jpg" | "jpeg" => bail!(
                 "--out {}: name a video *.mp4 or *.avi, or a folder, into which images are written as PNG",
@@ -122,10 +120,7 @@ impl Output {
     fn write(&mut self, frame: u64, pose: &Pose, camera: &Camera, view: &RenderedView) -> Result<()> {
         match self {
             Self::Images(folder) => png::write_view(&folder.join(format!("{frame:06}.png")), view),
-            Self::Video { file, floor, surface, area_m2 } => {
-                let (places, _) = skin_mesh(surface, pose);
-                file.write(&floor.paint(camera, view, &places, *area_m2), 0, nanos(frame))
-            }
+            Self::Video { file, floor } => file.write(&floor.paint(camera, view, pose), 0, nanos(frame)),
         }
     }
 
