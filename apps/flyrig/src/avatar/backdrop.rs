@@ -15,7 +15,8 @@ const FLOOR: f64 = 206.0;
 const GRID_M: f64 = 0.5;
 const LINE_M: f64 = 0.008;
 const LINE: f64 = 0.93;
-/// Distance of the floor's edge from the farthest part of the person, metres, and the inner part that does not fade.
+/// Radius of the floor: a multiple of the person's reach and a distance more, metres; and the inner part that does not fade.
+const REACHES: f64 = 1.3;
 const AROUND_M: f64 = 0.9;
 const SOLID: f64 = 0.6;
 /// Side of a cell of the shadow, metres.
@@ -48,7 +49,7 @@ impl Floor {
     pub fn new(middle: DVec2, reach_m: f64, body: Template) -> Result<Self, BodyError> {
         let points = sample_surface(&body, POINTS, 1)?;
         let each_m2 = body.area_m2() / POINTS as f64;
-        Ok(Self { middle, radius_m: reach_m + AROUND_M, body, points, each_m2 })
+        Ok(Self { middle, radius_m: REACHES * reach_m + AROUND_M, body, points, each_m2 })
     }
 
     /// Paints a view of the body in a pose over the backdrop.
