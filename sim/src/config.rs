@@ -118,6 +118,23 @@ pub enum MotionKind {
     Gltf,
 }
 
+impl MotionKind {
+    /// Generated motions by their names in a configuration.
+    pub const CLIPS: [(&'static str, Self); 11] = [
+        ("still", Self::Still),
+        ("turn", Self::Turn),
+        ("walk", Self::Walk),
+        ("wave", Self::Wave),
+        ("squat", Self::Squat),
+        ("reach", Self::Reach),
+        ("sit", Self::Sit),
+        ("jump", Self::Jump),
+        ("cross-arms", Self::CrossArms),
+        ("dance", Self::Dance),
+        ("lie", Self::Lie),
+    ];
+}
+
 /// Motion of the person.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields, default)]

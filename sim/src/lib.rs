@@ -72,7 +72,7 @@ pub use config::{Build, MotionConfig, MotionKind, PersonConfig, RingConfig, SimC
 pub use error::SimError;
 pub use files::export::{ExportOptions, Exported, export};
 pub use files::training::{SimSample, TrainingConfig, TrainingSamples, random_config};
-pub use motion::choice::find_debian_clip;
+pub use motion::choice::{clip_motion, find_debian_clip};
 pub use person::describe::describe_person;
 pub use room::scene_config::{LightConfig, LightSwitch, SceneConfig, SceneKind};
 pub use simulator::Simulator;

@@ -3,6 +3,7 @@
 
 mod support;
 
+use flyrig_capture::{CameraSource as _, VideoOptions, VideoReplay};
 use flyrig_gpu::{AdapterChoice, GpuContext};
 use flyrig_stream::{Posed, PosedAxes};
 use flyrig_tests::{run, write_dataset};
@@ -57,6 +58,18 @@ fn an_avatar_is_built_scored_driven_and_exported() {
     assert!(shown.pixels().filter(|pixel| pixel.0[3] > 200).count() > 200, "no person in the image");
     let exported = avatar(&["export", "a.flyavatar", "--out", "a.ply", "--motion", &motion]);
     assert!(exported.stdout.contains("4000 splats in a.ply"), "{exported:?}");
+    // A generated motion as a video: the person is in every image, on a floor.
+    let film = ["render", "a.flyavatar", "--motion", "walk", "--frames", "0..40", "--turn", "90", "--size", "96x96"];
+    let drawn = avatar(&[&film[..], &["--out", "a.mp4"]].concat());
+    assert_eq!(drawn.code, Some(0), "{drawn:?}");
+    assert!(drawn.stdout.contains("40 frames of") && !drawn.stdout.contains("cut off"), "{}", drawn.stdout);
+    let mut video = VideoReplay::open(&"a".into(), &folder.path().join("a.mp4"), &VideoOptions::default()).unwrap();
+    let frames: Vec<_> = std::iter::from_fn(|| video.next_frame(std::time::Duration::ZERO).ok()).collect();
+    assert_eq!(frames.len(), 40);
+    let dark = |frame: &flyrig_types::Frame| frame.image.bytes().iter().filter(|byte| **byte < 120).count();
+    assert!(frames.iter().all(|frame| dark(frame) > 150), "{:?}", frames.iter().map(dark).collect::<Vec<_>>());
+    let aside = avatar(&[&film[..], &["--out", "b.avi", "--eye", "-0.3,-0.6,1.6", "--target", "0,0,0.5"]].concat());
+    assert!(aside.code == Some(0) && aside.stdout.contains("the person is cut off in"), "{aside:?}");
 
     // Textures: an untouched texture changes nothing, a painted one changes the avatar.
     let done = |args: &[&str]| {
@@ -105,6 +118,22 @@ fn an_avatar_is_built_scored_driven_and_exported() {
     assert!(!folder.path().join("no.flyavatar").exists());
     refused(&["info", "nowhere.flyavatar"], "nowhere.flyavatar: No such file");
     refused(&["render", "a.flyavatar", "--motion", "a.png", "--out", "r"], "a.png is neither BVH nor glTF");
+    refused(&["render", "a.flyavatar", "--motion", "wlk", "--out", "r"], "one of still, turn, walk, wave, squat,");
+    let past = |more: &[&str]| {
+        refused(&[more, &["a.flyavatar", "--motion", &motion]].concat(), "frame 899 is past the end: ");
+    };
+    past(&["render", "--out", "past", "--frames", "3..900"]);
+    past(&["export", "--out", "past.ply", "--frame", "899"]);
+    assert!(!folder.path().join("past").exists() && !folder.path().join("past.ply").exists());
+    refused(
+        &["render", "a.flyavatar", "--motion", "walk", "--out", "a.mov"],
+        "name a video *.mp4 or *.avi, or a folder",
+    );
+    let nowhere = ["--eye", "0,0,1", "--target", "0,0,1"];
+    refused(
+        &[&["render", "a.flyavatar", "--motion", "walk", "--out", "a2.mp4"], &nowhere[..]].concat(),
+        "--eye and --target are the same place",
+    );
     refused(
         &[&["build", &take, "--inputs", "00,02", "--out", "no/folder/a.flyavatar"], &GIVEN[..]].concat(),
         "the folder no/folder does not exist",

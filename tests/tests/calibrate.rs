@@ -3,7 +3,7 @@
 
 use std::path::Path;
 
-use flyrig_calib::{Board, load_calibration, testing::photograph};
+use flyrig_calib::{Board, load_calibration, load_lenses, testing::photograph};
 use flyrig_tests::run;
 use flyrig_types::{Camera, Intrinsics, Isometry, Lens};
 use glam::{DQuat, DVec2, DVec3};
@@ -50,14 +50,30 @@ fn pose(board: &Board, i: u32) -> Isometry {
 }
 
 fn write_take(folder: &Path, board: &Board, cameras: &[Camera]) {
-    for camera in cameras {
-        let images = folder.join("images").join(camera.id.as_str());
-        std::fs::create_dir_all(&images).unwrap();
-        for i in 0..BOARDS {
-            let gray = photograph(board, camera, &pose(board, i), false).unwrap();
-            let image = image::GrayImage::from_raw(SIZE[0], SIZE[1], gray.pixels).unwrap();
-            image::DynamicImage::ImageLuma8(image).to_rgb8().save(images.join(format!("{i:06}.png"))).unwrap();
-        }
+    let order: Vec<Option<u32>> = (0..BOARDS).map(Some).collect();
+    cameras.iter().for_each(|camera| write_images(folder, board, camera, &order));
+}
+
+/// Writes the images of a camera: the boards of these numbers, or nothing but grey.
+fn write_images(folder: &Path, board: &Board, camera: &Camera, order: &[Option<u32>]) {
+    let images = folder.join("images").join(camera.id.as_str());
+    std::fs::create_dir_all(&images).unwrap();
+    for (i, shown) in order.iter().enumerate() {
+        let pixels = shown.map(|number| photograph(board, camera, &pose(board, number), false).unwrap().pixels);
+        let pixels = pixels.unwrap_or_else(|| vec![128; (SIZE[0] * SIZE[1]) as usize]);
+        let image = image::GrayImage::from_raw(SIZE[0], SIZE[1], pixels).unwrap();
+        image::DynamicImage::ImageLuma8(image).to_rgb8().save(images.join(format!("{i:06}.png"))).unwrap();
+    }
+}
+
+/// Asserts that lenses of a folder are those of the cameras with these names, to 3 pixels.
+fn assert_lenses(folder: &Path, names: &[&str]) {
+    let lenses = load_lenses(folder, &|_| None).unwrap();
+    assert_eq!(lenses.iter().map(|(id, _)| id.as_str()).collect::<Vec<_>>(), names);
+    for (id, found) in lenses {
+        let truth = cameras().into_iter().find(|camera| camera.id == id).unwrap().intrinsics;
+        let off = (found.focal_px - truth.focal_px).abs().max_element();
+        assert!(off < 3.0, "{id}: focal length off by {off} px");
     }
 }
 
@@ -117,4 +133,77 @@ fn a_printed_board_calibrates_lenses_and_rig() {
     assert_eq!(other.code, Some(1));
     assert!(other.stderr.contains("camera left: no board in its 26 images"), "{}", other.stderr);
     assert!(!folder.path().join("none").exists());
+}
+
+/// Returns the number of boards that a camera shares with the camera of a column of the page's first table.
+fn shares(page: &str, camera: &str, column: usize) -> u32 {
+    let row = page.split(&format!("<tr><td>{camera}<td>")).nth(1).unwrap().split("<tr>").next().unwrap();
+    row.split("</table>").next().unwrap().split("<td>").nth(column).unwrap().parse().unwrap()
+}
+
+#[test]
+fn cameras_that_no_board_joins_get_their_lenses_and_a_page_that_shows_who_shares_boards() {
+    let folder = tempfile::tempdir().unwrap();
+    let at = |path: &str| folder.path().join(path);
+    let command = |text: &str| run(PROGRAM, &text.split(' ').collect::<Vec<_>>(), folder.path()).unwrap();
+    let printed = command("calibrate board --columns 7 --rows 5 --square-mm 50 --dictionary DICT_4X4_50 --out board");
+    assert_eq!(printed.code, Some(0), "{}", printed.stderr);
+    let board = Board::load(&at("board/board.toml")).unwrap();
+    let cameras = cameras();
+    // Stills: the board stands where the left and the middle camera see it, then where the right one does.
+    let turns: Vec<[Option<u32>; 2]> = (0..BOARDS).flat_map(|i| [[Some(i), None], [None, Some(i)]]).collect();
+    for (camera, side) in cameras.iter().zip([0, 0, 1]) {
+        let order: Vec<Option<u32>> = turns.iter().map(|turn| turn[side]).collect();
+        write_images(&at("apart"), &board, camera, &order);
+    }
+    write_take(&at("together"), &board, &cameras);
+    let failed = |finished: flyrig_tests::Finished, expected: &[&str]| {
+        assert_eq!(finished.code, Some(1), "{}", finished.stdout);
+        let errors: Vec<&str> = finished.stderr.lines().filter(|line| line.starts_with("error:")).collect();
+        assert_eq!(errors.len(), 1, "{}", finished.stderr);
+        assert!(expected.iter().all(|part| errors[0].contains(part)), "{}", errors[0]);
+        finished.stdout
+    };
+    let page = |path: &str| std::fs::read_to_string(at(path)).unwrap();
+
+    // Every still is used without any option.
+    let apart = command("calibrate rig apart --out cal");
+    let groups = "no board joins the groups of cameras [left middle] and [right]; show it between them";
+    let stdout =
+        failed(apart, &[groups, "cal/calibration.html shows how many boards the cameras share", "--lenses cal/lenses"]);
+    assert!(stdout.contains("looked at all 52 frame sets"), "{stdout}");
+    assert_lenses(&at("cal/lenses"), &["left", "middle", "right"]);
+    assert!(!at("cal/calibration.toml").exists(), "a calibration without poses");
+    let shown = page("cal/calibration.html");
+    assert!(shown.contains(groups) && !shown.contains("NaN") && !shown.contains("http-equiv"), "{shown:.3000}");
+    assert!(
+        shares(&shown, "left", 1) >= 8 && shares(&shown, "left", 1) == shares(&shown, "middle", 0),
+        "{shown:.3000}"
+    );
+    let with_right = [("left", 2), ("middle", 2), ("right", 0), ("right", 1)];
+    assert!(with_right.iter().all(|(camera, other)| shares(&shown, camera, *other) == 0), "{shown:.3000}");
+
+    // With those lenses and the missing boards the same folder gets its calibration.
+    let joined = command("calibrate rig together --lenses cal/lenses --out cal");
+    assert_eq!(joined.code, Some(0), "{}", joined.stderr);
+    let found = load_calibration(&at("cal"), &|_| None).unwrap();
+    assert_eq!(found.cameras.len(), 3);
+    assert!(page("cal/calibration.html").contains("From above: cameras"));
+    // Lenses that are there are not replaced unasked.
+    std::fs::remove_file(at("cal/calibration.toml")).unwrap();
+    std::fs::remove_file(at("cal/calibration.json")).unwrap();
+    failed(
+        command("calibrate rig apart --out cal"),
+        &["cal/lenses/calibration.toml is there already; --force replaces it"],
+    );
+
+    // A camera that never saw the board: the lenses of the others are kept. Given lenses are not written again.
+    let none = vec![None; BOARDS as usize];
+    write_images(&at("together"), &board, &cameras[2], &none);
+    let unseen = command("calibrate rig together --out unseen");
+    failed(unseen, &["camera right: no board in its 26 images", "unseen/lenses holds the lenses of the other cameras"]);
+    assert_lenses(&at("unseen/lenses"), &["left", "middle"]);
+    assert!(shares(&page("unseen/calibration.html"), "left", 1) >= 8);
+    failed(command("calibrate rig together --lenses cal/lenses --out given"), &[groups, "given/calibration.html"]);
+    assert!(at("given/calibration.html").exists() && !at("given/lenses").exists());
 }

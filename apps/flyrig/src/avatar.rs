@@ -1,11 +1,14 @@
 //! `flyrig avatar`: personal avatars.
 
+mod backdrop;
 mod build;
 mod checkpoint;
 mod edit;
 mod eval;
 mod export;
+mod framing;
 mod inputs;
+mod motion;
 mod parts;
 mod render;
 
@@ -24,7 +27,7 @@ pub enum AvatarAction {
     Build(build::AvatarBuildArgs),
     /// Drive an avatar by the poses of a take, render the held-out cameras and score them.
     Eval(eval::AvatarEvalArgs),
-    /// Drive an avatar by a recorded motion and write images.
+    /// Drive an avatar by a motion and write a video or images.
     Render(render::AvatarRenderArgs),
     /// Change the colours of an avatar by a painted texture, or its shape.
     Edit(edit::AvatarEditArgs),

@@ -10,6 +10,7 @@ mod output;
 mod page;
 mod person;
 mod rig;
+mod unjoined;
 mod views;
 
 use anyhow::Result;

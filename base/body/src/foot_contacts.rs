@@ -41,11 +41,12 @@ struct Sole {
     half_width: f64,
 }
 
-/// Holds both feet of z-up poses in place where the source stands, soles on z = 0. `legs` are hip, knee, ankle and toe joints.
+/// Holds both feet of z-up poses in place where the source stands, soles on z = 0. `legs` are hip, knee, ankle and toe joints;
+/// `floor_y` is the floor of the bind pose, canonical metres, `sole_m` the thickness of soles below it.
 pub(crate) fn plant_feet(
     skeleton: &Skeleton,
     legs: &[[usize; 4]; 2],
-    sole_m: f64,
+    (floor_y, sole_m): (f64, f64),
     nanos: &[i64],
     source: &[FootSource; 2],
     poses: &mut [Pose],
@@ -54,7 +55,10 @@ pub(crate) fn plant_feet(
     let moves: Vec<Vec<DVec3>> = legs
         .iter()
         .zip(source)
-        .map(|(leg, foot)| foot_moves(skeleton, &Sole::new(&origins, leg, sole_m), leg, &stands(nanos, foot), poses))
+        .map(|(leg, foot)| {
+            let sole = Sole::new(&origins, leg, floor_y, sole_m);
+            foot_moves(skeleton, &sole, leg, &stands(nanos, foot), poses)
+        })
         .collect();
     // Lowers the hips where a leg would be too short.
     let mut too_high = vec![0.0f64; poses.len()];
@@ -86,11 +90,12 @@ pub(crate) fn plant_feet(
 
 impl Sole {
     /// Estimates a sole from the distance of ankle and toe joints, on the bind pose's floor or `sole_m` below it.
-    fn new(origins: &[DVec3], leg: &[usize; 4], sole_m: f64) -> Self {
+    fn new(origins: &[DVec3], leg: &[usize; 4], floor_y: f64, sole_m: f64) -> Self {
         let (ankle, toe) = (origins[leg[2]], origins[leg[3]]);
         let long = if leg[2] == leg[3] { 0.13 } else { (toe.z - ankle.z).abs().max(0.05) };
         // Shoes are longer by about half the sole's thickness.
-        let point = |x: f64, along: f64, longer: f64| DVec3::new(x, -ankle.y - sole_m, along * long + longer * sole_m);
+        let below = floor_y - sole_m - ankle.y;
+        let point = |x: f64, along: f64, longer: f64| DVec3::new(x, below, along * long + longer * sole_m);
         let across = if leg[2] == leg[3] { 0.0 } else { toe.x - ankle.x };
         // The ball stays below the joint of the toes, about which the foot turns.
         let canonical = [point(0.0, -0.55, -0.5), point(across, 1.0, 0.0), point(across, 1.55, 0.5)];

@@ -28,6 +28,7 @@ mod eliminate;
 mod error;
 mod finger_axes;
 mod fingers;
+mod floor;
 mod foot_contacts;
 mod glb_writer;
 mod gltf_export;

@@ -1,9 +1,10 @@
 //! Recorded motion of any skeleton, before retargeting.
 
+use flyrig_types::{Pose, PoseTrack};
 use glam::{DQuat, DVec3};
 
 use crate::bvh::BvhLocal;
-use crate::{BodyError, BvhClip, BvhJoint, GltfHuman};
+use crate::{BodyError, BvhClip, BvhJoint, GltfHuman, Skeleton};
 
 /// Joint in a frame: position, and rotation away from the rest pose, both in the file's world (y up).
 #[derive(Debug, Clone, Copy, PartialEq)]
@@ -12,7 +13,7 @@ pub(crate) struct Moved {
     pub turned: DQuat,
 }
 
-/// Motion with its skeleton, from a BVH clip ([`BvhClip::motion`]) or a glTF file ([`GltfHuman::motion`]);
+/// Motion with its skeleton, from a BVH clip ([`BvhClip::motion`]), a glTF file ([`GltfHuman::motion`]) or poses of a body;
 /// [`MotionClip::retarget`] transfers it to a body.
 #[derive(Debug, Clone, PartialEq)]
 pub struct MotionClip {
@@ -74,33 +75,46 @@ impl BvhClip {
     }
 }
 
+impl MotionClip {
+    /// Returns the poses of a body in the world (z up) as a motion, whose rest pose is the bind pose. `what` names it in messages.
+    #[must_use]
+    pub fn from_poses(what: &str, skeleton: &Skeleton, track: &PoseTrack) -> Self {
+        Self::from_track(what, skeleton, track, DQuat::from_rotation_x(-std::f64::consts::FRAC_PI_2))
+    }
+
+    /// Returns poses as a motion, turned by `turn` to y up.
+    fn from_track(what: &str, skeleton: &Skeleton, track: &PoseTrack, turn: DQuat) -> Self {
+        let joints = skeleton.joints();
+        let rest: Vec<DQuat> = joints.iter().map(|joint| joint.bind_rotation().inverse()).collect();
+        let frame = |(nanos, pose): &(i64, Pose)| {
+            let world = skeleton.world_from_joint(pose);
+            let moved = world.iter().zip(&rest).map(|(world, rest)| Moved {
+                position: turn * world.w_axis.truncate(),
+                turned: (turn * DQuat::from_mat4(world) * *rest).normalize(),
+            });
+            (*nanos, moved.collect())
+        };
+        Self {
+            what: what.to_owned(),
+            names: joints.iter().map(|joint| joint.name.clone()).collect(),
+            parents: joints.iter().map(|joint| joint.parent).collect(),
+            axes_are_stated: true,
+            origins: skeleton.canonical_origins(),
+            frames: track.keys().iter().map(frame).collect(),
+        }
+    }
+}
+
 impl GltfHuman {
     /// Returns the file's first animation as a motion for retargeting; its rest pose is the bind pose.
     ///
     /// # Errors
     /// [`BodyError::Skeleton`] when the file has no animation.
     pub fn motion(&self) -> Result<MotionClip, BodyError> {
-        let (template, what) = (&self.template, format!("'{}'", self.template.name));
+        let what = format!("'{}'", self.template.name);
         let Some(track) = &self.track else {
             return Err(BodyError::Skeleton(format!("{what} has no animation; export one with the body")));
         };
-        let joints = template.skeleton.joints();
-        let rest: Vec<DQuat> = joints.iter().map(|joint| joint.bind_rotation().inverse()).collect();
-        let frame = |(nanos, pose): &(i64, flyrig_types::Pose)| {
-            let world = template.skeleton.world_from_joint(pose);
-            let moved = world.iter().zip(&rest).map(|(world, rest)| Moved {
-                position: world.w_axis.truncate(),
-                turned: (DQuat::from_mat4(world) * *rest).normalize(),
-            });
-            (*nanos, moved.collect())
-        };
-        Ok(MotionClip {
-            what,
-            names: joints.iter().map(|joint| joint.name.clone()).collect(),
-            parents: joints.iter().map(|joint| joint.parent).collect(),
-            axes_are_stated: true,
-            origins: template.skeleton.canonical_origins(),
-            frames: track.keys().iter().map(frame).collect(),
-        })
+        Ok(MotionClip::from_track(&what, &self.template.skeleton, track, DQuat::IDENTITY))
     }
 }

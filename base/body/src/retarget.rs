@@ -9,16 +9,13 @@ use crate::joint_names::{Named, match_joints};
 use crate::motion_clip::{MotionClip, Moved};
 use crate::part::part_of_joints;
 use crate::rest_alignment::at_source_rest;
-use crate::{BodyError, BvhClip, Part, Skeleton};
+use crate::{BodyError, BvhClip, Part, Skeleton, Template};
 
 /// Rotation about x from the files' y up to the z up of our pose tracks, radians.
 const Z_UP_FROM_Y_UP: f64 = std::f64::consts::FRAC_PI_2;
 
 /// Quantile of the lowest foot heights of a clip that is taken as floor.
 const FLOOR_QUANTILE: f64 = 0.05;
-
-/// Height of the toe joint above the sole where the bind pose gives none, metres.
-const USUAL_TOE_HEIGHT_M: f64 = 0.03;
 
 /// Joints of the legs, which give the scale.
 const LEGS: [[&str; 4]; 2] =
@@ -32,7 +29,7 @@ pub struct RetargetOptions {
     /// Largest distance from the origin, metres: the middle of the path is moved to the origin, and a longer path is scaled down
     /// together with its steps, so that feet do not slide. `None` leaves the motion in place.
     pub reach_m: Option<f64>,
-    /// Thickness of soles between feet and floor, metres.
+    /// Thickness of soles between the body's own feet ([`Template::floor_y`]) and the floor, metres.
     pub sole_m: f64,
 }
 
@@ -41,39 +38,41 @@ impl BvhClip {
     ///
     /// # Errors
     /// As [`MotionClip::retarget`].
-    pub fn retarget(&self, skeleton: &Skeleton) -> Result<PoseTrack, BodyError> {
-        self.motion().retarget(skeleton, &RetargetOptions::default())
+    pub fn retarget(&self, body: &Template) -> Result<PoseTrack, BodyError> {
+        self.motion().retarget(body, &RetargetOptions::default())
     }
 }
 
 impl MotionClip {
-    /// Transfers the motion to another skeleton, by the joints' names in the usual rigs (case, separators and a `prefix:` do not
+    /// Transfers the motion to another body, by the joints' names in the usual rigs (case, separators and a `prefix:` do not
     /// matter). World: z up, the floor at z = 0; a motion that faces +z of the file faces -y.
     ///
     /// A joint rotates in the world as the source's does from its rest pose. The source may rest in another pose than our bind pose:
     /// `rest_alignment.rs` says how trunk and limbs are turned to it first. A format that states no axes (BVH) is checked against the
     /// person: other axes than y up, right-handed, are turned, with a warning. Joints that the source lacks stay at rest; a
     /// warning names them. The path of the hips is scaled by the length of the legs, and lifted so that the feet are on the
-    /// floor when they are lowest (5 % of the frames). Feet are turned so that they are level where the source's stand (heel and ball low and slow).
+    /// floor when they are lowest (5 % of the frames); [`Template::floor_y`] is the floor of the bind pose. Feet are turned so that they are level where the source's stand (heel and ball low and slow).
     /// There, ours are held in place and on the floor by two-bone inverse kinematics, and hips too high for that are lowered smoothly.
     ///
     /// # Errors
     /// [`BodyError::Skeleton`] lists the legs' joints that are missing on either side, [`BodyError::Track`].
-    pub fn retarget(&self, skeleton: &Skeleton, options: &RetargetOptions) -> Result<PoseTrack, BodyError> {
+    pub fn retarget(&self, body: &Template, options: &RetargetOptions) -> Result<PoseTrack, BodyError> {
+        let skeleton = &body.skeleton;
         let named: Vec<Named<'_>> =
             self.names.iter().zip(&self.parents).map(|(name, &parent)| Named { name, parent }).collect();
         let source = match_joints(skeleton, &named, &self.what)?;
         let turned = self.with_usual_axes(&landmarks(skeleton, &source)?);
-        turned.as_ref().unwrap_or(self).retarget_matched(skeleton, source, options)
+        turned.as_ref().unwrap_or(self).retarget_matched(body, source, options)
     }
 
-    /// Transfers the motion with the source joint of each joint of `skeleton`.
+    /// Transfers the motion with the source joint of each joint of `body`.
     fn retarget_matched(
         &self,
-        skeleton: &Skeleton,
+        body: &Template,
         source: Vec<Option<usize>>,
         options: &RetargetOptions,
     ) -> Result<PoseTrack, BodyError> {
+        let (skeleton, floor_y) = (&body.skeleton, body.floor_y());
         let map = Map::new(self, skeleton, source)?;
         let start_nanos =
             self.frames.first().map_or(0, |frame| frame.0).saturating_add((options.start_secs * 1e9) as i64);
@@ -91,7 +90,7 @@ impl MotionClip {
         level_feet(skeleton, &legs, &nanos, &feet, &mut poses);
         let mut lowest: Vec<f64> = poses.iter().map(|pose| map.lowest_foot(pose)).collect();
         lowest.sort_by(f64::total_cmp);
-        let floor = lowest.get((lowest.len() as f64 * FLOOR_QUANTILE) as usize).copied().unwrap_or(0.0);
+        let lowest_foot_y = lowest.get((lowest.len() as f64 * FLOOR_QUANTILE) as usize).copied().unwrap_or(0.0);
         poses.drain(..start);
         for foot in &mut feet {
             foot.ankle.drain(..start);
@@ -99,7 +98,7 @@ impl MotionClip {
         }
         let z_up = DQuat::from_rotation_x(Z_UP_FROM_Y_UP);
         for pose in &mut poses {
-            pose.root_translation.y += map.toe_height + options.sole_m - floor;
+            pose.root_translation.y += map.lowest_foot_y - floor_y + options.sole_m - lowest_foot_y;
             pose.root_translation = z_up * pose.root_translation;
             pose.joint_rotations[0] = (z_up * pose.joint_rotations[0]).normalize();
         }
@@ -107,7 +106,7 @@ impl MotionClip {
             shrink_way(&mut poses, reach_m);
         }
         let nanos: Vec<i64> = nanos[start..].iter().map(|at| at - nanos[start]).collect();
-        plant_feet(skeleton, &legs, options.sole_m, &nanos, &feet, &mut poses);
+        plant_feet(skeleton, &legs, (floor_y, options.sole_m), &nanos, &feet, &mut poses);
         let keys = nanos.into_iter().zip(poses).collect();
         PoseTrack::new(keys).map_err(|source| BodyError::Track { what: self.what.clone(), source })
     }
@@ -157,8 +156,8 @@ struct Map<'a> {
     scale: f64,
     legs: [LegMap; 2],
     feet: Vec<usize>,
-    /// Height of the lowest foot joint above the floor in the bind pose, metres.
-    toe_height: f64,
+    /// Height of the lowest joint of the feet in the bind pose, canonical metres.
+    lowest_foot_y: f64,
 }
 
 impl<'a> Map<'a> {
@@ -205,7 +204,7 @@ impl<'a> Map<'a> {
             scale: ours / theirs,
             legs: [left, right],
             feet,
-            toe_height: if (0.0..0.15).contains(&lowest) { lowest } else { USUAL_TOE_HEIGHT_M },
+            lowest_foot_y: lowest,
         })
     }
 

@@ -4,7 +4,9 @@
 
 use std::path::Path;
 
-use flyrig_body::{BodyError, BvhChannel, BvhClip, ShapeParams, Skeleton, default_template, load_bvh, parse_bvh};
+use flyrig_body::{
+    BodyError, BvhChannel, BvhClip, ShapeParams, Skeleton, Template, default_template, load_bvh, parse_bvh,
+};
 use flyrig_types::Pose;
 use glam::{DQuat, DVec3};
 
@@ -75,8 +77,8 @@ fn parse(text: &str) -> Result<BvhClip, BodyError> {
     parse_bvh(text, Path::new("test.bvh"))
 }
 
-fn body() -> Skeleton {
-    default_template(&ShapeParams::man()).unwrap().skeleton
+fn body() -> Template {
+    default_template(&ShapeParams::man()).unwrap()
 }
 
 fn place(skeleton: &Skeleton, pose: &Pose, name: &str) -> DVec3 {
@@ -134,12 +136,13 @@ fn errors_name_the_line() {
 
 #[test]
 fn limbs_take_the_clips_directions_and_the_world_is_z_up() {
-    let skeleton = body();
-    let track = parse(CLIP).unwrap().retarget(&skeleton).unwrap();
+    let body = body();
+    let skeleton = &body.skeleton;
+    let track = parse(CLIP).unwrap().retarget(&body).unwrap();
     assert_eq!(track.span_nanos(), (0, 500_000_000));
     let (rest, moved) = (track.at(0), track.at(500_000_000));
     let bone =
-        |pose: &Pose, from: &str, to: &str| (place(&skeleton, pose, to) - place(&skeleton, pose, from)).normalize();
+        |pose: &Pose, from: &str, to: &str| (place(skeleton, pose, to) - place(skeleton, pose, from)).normalize();
     let near = |a: DVec3, b: DVec3| assert!((a - b).length() < 1e-6, "{a} is not {b}");
     // Our bind pose has the arms down; the clip's rest has them along x.
     near(bone(&rest, "LeftArm", "LeftForeArm"), DVec3::X);
@@ -161,35 +164,37 @@ fn limbs_take_the_clips_directions_and_the_world_is_z_up() {
 fn the_way_is_scaled_by_the_legs_and_the_feet_are_on_the_floor() {
     let clip = parse(CLIP).unwrap();
     for shape in [ShapeParams::man(), ShapeParams::child()] {
-        let skeleton = default_template(&shape).unwrap().skeleton;
-        let track = clip.retarget(&skeleton).unwrap();
+        let body = default_template(&shape).unwrap();
+        let skeleton = &body.skeleton;
+        let track = clip.retarget(&body).unwrap();
         let origins = skeleton.canonical_origins();
         let at = |name: &str| origins[skeleton.joint(name).unwrap()];
         let leg = at("LeftUpLeg").distance(at("LeftLeg")) + at("LeftLeg").distance(at("LeftFoot"));
-        let hips = |pose: &Pose| (place(&skeleton, pose, "LeftUpLeg") + place(&skeleton, pose, "RightUpLeg")) * 0.5;
+        let hips = |pose: &Pose| (place(skeleton, pose, "LeftUpLeg") + place(skeleton, pose, "RightUpLeg")) * 0.5;
         let way = hips(&track.at(500_000_000)) - hips(&track.at(0));
         assert!((way - DVec3::new(0.4, -1.0, 0.0) * (leg / 0.8)).length() < 1e-6, "{way}");
         let lowest =
-            place(&skeleton, &track.at(0), "LeftToeBase").z.min(place(&skeleton, &track.at(0), "RightToeBase").z);
+            place(skeleton, &track.at(0), "LeftToeBase").z.min(place(skeleton, &track.at(0), "RightToeBase").z);
         assert!((lowest - at("LeftToeBase").y).abs() < 1e-3, "{lowest}");
     }
 }
 
 #[test]
 fn a_clip_that_does_not_fit_says_what_is_missing() {
-    let skeleton = body();
-    let error = parse(&CLIP.replace("LeftLeg", "limb_7")).unwrap().retarget(&skeleton).unwrap_err().to_string();
+    let body = body();
+    let error = parse(&CLIP.replace("LeftLeg", "limb_7")).unwrap().retarget(&body).unwrap_err().to_string();
     assert!(error.contains("test.bvh has no joint 'LeftLeg'"), "{error}");
     let flat = parse(&CLIP.replace("OFFSET 0 -0.4 0", "OFFSET 0 0 0")).unwrap();
-    assert!(flat.retarget(&skeleton).unwrap_err().to_string().contains("legs of no length"));
+    assert!(flat.retarget(&body).unwrap_err().to_string().contains("legs of no length"));
     // Case and prefixes do not matter.
-    parse(&CLIP.replace("JOINT Left", "JOINT mixamorig:left")).unwrap().retarget(&skeleton).unwrap();
+    parse(&CLIP.replace("JOINT Left", "JOINT mixamorig:left")).unwrap().retarget(&body).unwrap();
 }
 
 #[test]
 fn joints_that_the_clip_does_not_know_stay_at_rest() {
-    let skeleton = body();
-    let pose = parse(CLIP).unwrap().retarget(&skeleton).unwrap().at(500_000_000);
+    let body = body();
+    let skeleton = &body.skeleton;
+    let pose = parse(CLIP).unwrap().retarget(&body).unwrap().at(500_000_000);
     for name in ["RightForeArm", "Head", "LThumb"] {
         let joint = skeleton.joint(name).unwrap();
         assert!(pose.joint_rotations[joint].angle_between(DQuat::IDENTITY) < 1e-9, "{name}");

@@ -6,7 +6,7 @@ use std::collections::BTreeMap;
 use std::fmt::Write as _;
 use std::path::Path;
 
-use flyrig_body::{BodyError, ShapeParams, Skeleton, default_template, load_bvh, parse_bvh};
+use flyrig_body::{BodyError, ShapeParams, Skeleton, Template, default_template, load_bvh, parse_bvh};
 use flyrig_types::PoseTrack;
 use glam::{DMat3, DQuat, DVec3, EulerRot};
 
@@ -218,13 +218,13 @@ impl Form<'_> {
         writeln!(text, "{pad}}}").unwrap();
     }
 
-    fn track(&self, skeleton: &Skeleton) -> PoseTrack {
-        parse_bvh(&self.text(), Path::new("test.bvh")).unwrap().retarget(skeleton).unwrap()
+    fn track(&self, body: &Template) -> PoseTrack {
+        parse_bvh(&self.text(), Path::new("test.bvh")).unwrap().retarget(body).unwrap()
     }
 }
 
-fn body() -> Skeleton {
-    default_template(&ShapeParams::man()).unwrap().skeleton
+fn body() -> Template {
+    default_template(&ShapeParams::man()).unwrap()
 }
 
 /// Asserts that both tracks have the same joints in all frames, within `most_m`, the place of the root included.
@@ -246,24 +246,26 @@ fn assert_same(skeleton: &Skeleton, a: &PoseTrack, b: &PoseTrack, most_m: f64, w
 
 #[test]
 fn a_rest_pose_with_all_bones_along_an_axis_gives_the_same_motion() {
-    let skeleton = body();
-    let usual = Form::default().track(&skeleton);
+    let body = body();
+    let skeleton = &body.skeleton;
+    let usual = Form::default().track(&body);
     for axis in [DVec3::X, DVec3::Y, DVec3::Z, DVec3::NEG_X] {
         for six in [false, true] {
             let odd = Form { rest: Rest::Along(axis), six, ..Form::default() };
-            assert_same(&skeleton, &usual, &odd.track(&skeleton), 0.015, &format!("along {axis}, six {six}"));
+            assert_same(skeleton, &usual, &odd.track(&body), 0.015, &format!("along {axis}, six {six}"));
         }
     }
     let mirrored = Form { rest: Rest::Mirrored, ..Form::default() };
-    assert_same(&skeleton, &usual, &mirrored.track(&skeleton), 0.015, "mirrored");
+    assert_same(skeleton, &usual, &mirrored.track(&body), 0.015, "mirrored");
 }
 
 #[test]
 fn bones_follow_the_source_at_trunk_neck_and_feet() {
-    let skeleton = body();
+    let body = body();
+    let skeleton = &body.skeleton;
     for rest in [Rest::T, Rest::Along(DVec3::X), Rest::Ballet] {
         let form = Form { rest, ..Form::default() };
-        let track = form.track(&skeleton);
+        let track = form.track(&body);
         let world = skeleton.world_from_joint(&track.keys()[0].1);
         let at = |joint: &str| world[skeleton.joint(joint).unwrap()].w_axis.truncate();
         // Forward kinematics of the motion itself.
@@ -287,8 +289,9 @@ fn bones_follow_the_source_at_trunk_neck_and_feet() {
 
 #[test]
 fn other_axes_are_read_off_the_person() {
-    let skeleton = body();
-    let usual = Form::default().track(&skeleton);
+    let body = body();
+    let skeleton = &body.skeleton;
+    let usual = Form::default().track(&body);
     let turns = [
         ("z up", DMat3::from_rotation_x(90f64.to_radians())),
         ("x up", DMat3::from_rotation_z(-90f64.to_radians())),
@@ -299,11 +302,11 @@ fn other_axes_are_read_off_the_person() {
     for rest in [Rest::T, Rest::Along(DVec3::X)] {
         for (what, axes) in turns {
             // A left-handed file and its mirror image differ by the side to which the person walks.
-            let mut track = Form { axes, rest, ..Form::default() }.track(&skeleton);
+            let mut track = Form { axes, rest, ..Form::default() }.track(&body);
             if what == "left-handed, z up" {
                 track = turned(&track, DQuat::from_rotation_z(std::f64::consts::PI));
             }
-            assert_same(&skeleton, &usual, &track, 0.016, what);
+            assert_same(skeleton, &usual, &track, 0.016, what);
         }
     }
 }
@@ -321,12 +324,13 @@ fn turned(track: &PoseTrack, turn: DQuat) -> PoseTrack {
 
 #[test]
 fn a_person_who_lies_is_not_turned_upright() {
-    let skeleton = body();
+    let body = body();
+    let skeleton = &body.skeleton;
     let motion = |joint: &str, _: f64| match joint {
         "Hips" => DQuat::from_rotation_x(-90f64.to_radians()),
         _ => DQuat::IDENTITY,
     };
-    let track = Form { motion, ..Form::default() }.track(&skeleton);
+    let track = Form { motion, ..Form::default() }.track(&body);
     let world = skeleton.world_from_joint(&track.keys()[2].1);
     let at = |joint: &str| world[skeleton.joint(joint).unwrap()].w_axis.truncate();
     let up = (at("Head") - at("Hips")).normalize();
@@ -335,8 +339,9 @@ fn a_person_who_lies_is_not_turned_upright() {
 
 #[test]
 fn names_of_other_programs_give_the_same_motion() {
-    let skeleton = body();
-    let usual = Form::default().track(&skeleton);
+    let body = body();
+    let skeleton = &body.skeleton;
+    let usual = Form::default().track(&body);
     let ours = PERSON.map(|(name, ..)| name);
     let rigs: [(&str, [&str; 21]); 5] = [
         (
@@ -453,35 +458,37 @@ fn names_of_other_programs_give_the_same_motion() {
     ];
     for (what, names) in rigs {
         let rename = |name: &str| names[ours.iter().position(|own| *own == name).unwrap()].to_owned();
-        let track = Form { rename: &rename, ..Form::default() }.track(&skeleton);
+        let track = Form { rename: &rename, ..Form::default() }.track(&body);
         // One more or one less joint of the spine shares the bend differently.
         let most_m = if what == "Acclaim" { 0.02 } else { 1e-6 };
-        assert_same(&skeleton, &usual, &track, most_m, what);
+        assert_same(skeleton, &usual, &track, most_m, what);
     }
 }
 
 #[test]
 fn positions_of_joints_may_replace_or_add_to_their_offsets_in_any_unit() {
-    let skeleton = body();
-    let usual = Form::default().track(&skeleton);
+    let body = body();
+    let skeleton = &body.skeleton;
+    let usual = Form::default().track(&body);
     for (what, offsets, scale) in [
         ("no offsets", [0.0, 0.0], 100.0),
         ("positions relative to the offsets", [1.0, 1.0], 100.0),
         ("metres", [1.0, 0.0], 1.0),
         ("inches", [1.0, 0.0], 39.37),
     ] {
-        let track = Form { six: true, offsets, scale, ..Form::default() }.track(&skeleton);
-        assert_same(&skeleton, &usual, &track, 1e-3, what);
+        let track = Form { six: true, offsets, scale, ..Form::default() }.track(&body);
+        assert_same(skeleton, &usual, &track, 1e-3, what);
     }
 }
 
 #[test]
 fn feet_are_level_where_the_source_stands() {
-    let skeleton = body();
+    let body = body();
+    let skeleton = &body.skeleton;
     // Twenty frames of standing, with the ankle of the source lower above the toes than ours.
     let motion = |_: &str, _: f64| DQuat::IDENTITY;
     for rest in [Rest::T, Rest::Along(DVec3::X)] {
-        let track = Form { rest, motion, way: |_| DVec3::ZERO, frames: 20, ..Form::default() }.track(&skeleton);
+        let track = Form { rest, motion, way: |_| DVec3::ZERO, frames: 20, ..Form::default() }.track(&body);
         let world = skeleton.world_from_joint(&track.keys()[10].1);
         for name in ["LeftFoot", "RightFoot"] {
             let joint = skeleton.joint(name).unwrap();

@@ -3,7 +3,7 @@
 use std::f64::consts::TAU;
 use std::path::{Path, PathBuf};
 
-use flyrig_body::{MotionClip, RetargetOptions, Skeleton, load_bvh, load_gltf_motion};
+use flyrig_body::{MotionClip, RetargetOptions, ShapeParams, Template, default_template, load_bvh, load_gltf_motion};
 use flyrig_types::{Pose, PoseTrack};
 use glam::DVec3;
 use rand::{RngExt, SeedableRng, rngs::StdRng};
@@ -64,11 +64,11 @@ fn track_around_origin(config: &SimConfig, person: &Person) -> Result<PoseTrack,
     match motion.kind {
         MotionKind::Bvh => {
             let path = motion.bvh.as_deref().map_or_else(find_debian_clip, existing)?;
-            recorded(&load_bvh(&path)?.motion(), skeleton, &motion)
+            recorded(&load_bvh(&path)?.motion(), &person.body, &motion)
         }
         MotionKind::Gltf => {
             let path = existing(motion.gltf.as_deref().unwrap_or(Path::new("motion.gltf")))?;
-            recorded(&load_gltf_motion(&path)?, skeleton, &motion)
+            recorded(&load_gltf_motion(&path)?, &person.body, &motion)
         }
         kind => {
             let puppet = Puppet::new(skeleton, &person.clothed)?;
@@ -80,6 +80,18 @@ fn track_around_origin(config: &SimConfig, person: &Person) -> Result<PoseTrack,
             }
         }
     }
+}
+
+/// Returns one cycle of a generated motion of the average body, for any body; other kinds stand still.
+///
+/// # Errors
+/// [`SimError::NoJoint`], [`SimError::Pose`].
+pub fn clip_motion(kind: MotionKind) -> Result<MotionClip, SimError> {
+    let body = default_template(&ShapeParams::default())?;
+    let puppet = Puppet::new(&body.skeleton, &body)?;
+    let MotionConfig { turn_secs, speed, phase, .. } = MotionConfig::default();
+    let track = clip(kind, &puppet, SimConfig::default().seed, turn_secs, speed).track(&puppet, phase)?;
+    Ok(MotionClip::from_poses("the clip", &body.skeleton, &track))
 }
 
 /// Draws clip, speed and phase from the seed.
@@ -109,10 +121,10 @@ pub(crate) fn pass_by(person: &Person, seed: u64, reach_m: f64) -> Result<PoseTr
 
 /// Retargets a recorded motion to a person, around the origin, with the shoes' soles on the floor. Feet stay where the
 /// source's stand.
-fn recorded(clip: &MotionClip, skeleton: &Skeleton, motion: &MotionConfig) -> Result<PoseTrack, SimError> {
+fn recorded(clip: &MotionClip, body: &Template, motion: &MotionConfig) -> Result<PoseTrack, SimError> {
     let (start_secs, reach_m, sole_m) = (motion.start_secs, Some(motion.reach_m), f64::from(SOLE_M));
     let options = RetargetOptions { start_secs, reach_m, sole_m };
-    let track = clip.retarget(skeleton, &options)?;
+    let track = clip.retarget(body, &options)?;
     // Recorded at one speed, played at another; at none the first pose is held.
     let paced = |(nanos, pose): &(i64, Pose)| ((*nanos as f64 / motion.speed.max(1e-3)) as i64, pose.clone());
     let count = if motion.speed > 0.0 { track.keys().len() } else { 1 };

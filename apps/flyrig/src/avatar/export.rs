@@ -11,10 +11,7 @@ use flyrig_report::{png, write_whole};
 use flyrig_types::PoseTrack;
 use glam::{DQuat, Quat};
 
-use super::{
-    inputs::load,
-    render::{motion, pose_at},
-};
+use super::{inputs::load, motion::Motion};
 
 /// Arguments of `flyrig avatar export`.
 #[derive(Debug, Args)]
@@ -27,7 +24,7 @@ pub struct AvatarExportArgs {
     /// Write a textured mesh of the clothed surface with bones (*.glb) instead of splats, animated by --motion.
     #[arg(long)]
     pub mesh: bool,
-    /// Motion that poses it (BVH or glTF); the rest pose otherwise.
+    /// Motion that poses it (BVH or glTF, or the name of a generated one); the rest pose otherwise.
     #[arg(long)]
     pub motion: Option<PathBuf>,
     /// Frame of the motion for splats, at 30 per second.
@@ -81,8 +78,9 @@ fn encode(atlas: &Atlas) -> Result<Vec<u8>> {
 
 fn mesh(avatar: &Avatar, args: &AvatarExportArgs) -> Result<()> {
     let texture = encode(&avatar.atlas(args.resolution.side)?)?;
-    let track = args.motion.as_deref().map(|path| y_up(&motion(avatar, path)?)).transpose()?;
     let mut surface = avatar.surface();
+    let motion = args.motion.as_deref().map(|motion| Motion::load(&surface, motion)).transpose()?;
+    let track = motion.map(|motion| y_up(motion.track())).transpose()?;
     surface.normals = avatar.template.normals_at(&surface.positions);
     write_glb(&args.out, &surface, GlbContents { track: track.as_ref(), texture: Some(&texture) })?;
     let (vertices, joints) = (surface.positions.len(), surface.skeleton.joints().len());
@@ -106,7 +104,11 @@ fn y_up(track: &PoseTrack) -> Result<PoseTrack> {
 
 fn splats(avatar: &Avatar, args: &AvatarExportArgs, ending: &str) -> Result<()> {
     let pose = match &args.motion {
-        Some(path) => pose_at(&motion(avatar, path)?, args.frame),
+        Some(motion) => {
+            let motion = Motion::load(&avatar.surface(), motion)?;
+            motion.check(args.frame)?;
+            motion.pose(args.frame)
+        }
         None => avatar.template.skeleton.rest_pose(),
     };
     let mut posed = PosedAvatar::default();

@@ -1,4 +1,4 @@
-//! `flyrig avatar render`: renders an avatar driven by a recorded motion.
+//! `flyrig avatar render`: renders an avatar driven by a motion, as images or as a video.
 
 use std::{
     ops::Range,
@@ -7,106 +7,128 @@ use std::{
 
 use anyhow::{Context as _, Result, bail};
 use clap::Args;
-use flyrig_avatar::{Avatar, DetailedScene};
-use flyrig_body::{RetargetOptions, load_bvh, load_gltf_motion};
+use flyrig_avatar::DetailedScene;
+use flyrig_body::Template;
 use flyrig_gpu::GpuContext;
 use flyrig_report::{
     arguments::{parse_range, parse_size},
     png, progress_bar, stop,
 };
-use flyrig_types::{Camera, Intrinsics, Isometry, Lens, Pose, PoseTrack};
-use glam::{DQuat, DVec2, DVec3};
+use flyrig_types::{Camera, Pose, RenderedView};
+use glam::DVec3;
 
-use super::inputs::{load, print_far};
+use super::{
+    backdrop::Floor,
+    framing::{PartBoxes, View, ViewArgs},
+    inputs::{load, print_far},
+    motion::{Motion, nanos},
+};
+use crate::video_file::VideoFile;
 
 /// Arguments of `flyrig avatar render`.
 #[derive(Debug, Args)]
 pub struct AvatarRenderArgs {
     /// The avatar (*.flyavatar).
     pub avatar: PathBuf,
-    /// Recorded motion: BVH or animated glTF.
+    /// Recorded motion (BVH or animated glTF), or the name of a generated one, such as walk, dance or turn.
     #[arg(long)]
     pub motion: PathBuf,
-    /// Folder of the images.
+    /// Video (*.mp4, *.avi), on a floor with the person's shadow, or folder of images with a transparent background.
     #[arg(long)]
     pub out: PathBuf,
-    /// Frames of the motion FIRST..END, END excluded, at 30 per second.
-    #[arg(long, default_value = "0..30", value_parser = parse_range)]
-    pub frames: Range<u64>,
+    /// Frames of the motion FIRST..END, END excluded, at 30 per second; the whole motion otherwise.
+    #[arg(long, value_parser = parse_range)]
+    pub frames: Option<Range<u64>>,
     /// Size of the images, pixels.
     #[arg(long, default_value = "512x768", value_parser = parse_size)]
     pub size: [u32; 2],
+    #[command(flatten)]
+    pub view: ViewArgs,
 }
-
-/// Frame rate of the images, frames per second.
-pub(super) const FPS: f64 = 30.0;
-/// Distance and height of the camera, metres.
-const AWAY_M: f64 = 3.6;
-const HEIGHT_M: f64 = 1.1;
 
 /// Runs `render`.
 pub fn render(args: &AvatarRenderArgs, gpu: &GpuContext) -> Result<()> {
     let avatar = load(&args.avatar)?;
-    let track = motion(&avatar, &args.motion)?;
-    std::fs::create_dir_all(&args.out).with_context(|| format!("cannot create {}", args.out.display()))?;
+    let surface = avatar.surface();
+    let motion = Motion::load(&surface, &args.motion)?;
+    let frames = args.frames.clone().unwrap_or(0..motion.frames());
+    motion.check(frames.end - 1)?;
+    let poses: Vec<Pose> = frames.clone().map(|frame| motion.pose(frame)).collect();
+    let boxes = PartBoxes::new(&surface);
+    let clip: Vec<Vec<DVec3>> = poses.iter().map(|pose| boxes.corners(&surface.skeleton, pose)).collect();
+    let view = View::new(&args.view, args.size, &clip)?;
+    let mut out = Output::create(&args.out, args.size, &view, surface)?;
     let mut scene = DetailedScene::new(gpu, avatar, true)?;
-    let bar = progress_bar(args.frames.end - args.frames.start, "avatar render");
-    let (mut far, mut drawn) = (0.0, 0);
-    for frame in args.frames.clone() {
+    let bar = progress_bar(poses.len() as u64, "avatar render");
+    let (mut far, mut gaussians, mut drawn) = (0.0, 0, 0);
+    for (frame, pose) in frames.zip(&poses) {
         if stop::requested() {
             break;
         }
-        let pose = pose_at(&track, frame);
-        scene.pose(&pose, None);
-        far += scene.avatar().far_share(&pose);
-        let view = scene.draw(&camera(args.size, pose.root_translation))?;
-        drawn += scene.drawn().0;
-        png::write_view(&args.out.join(format!("{frame:06}.png")), &view)?;
+        let camera = view.camera(drawn as f64 / poses.len() as f64);
+        scene.pose(pose, None);
+        far += scene.avatar().far_share(pose);
+        out.write(frame, pose, &camera, &scene.draw(&camera)?)?;
+        gaussians += scene.drawn().0;
+        drawn += 1;
         bar.inc(1);
     }
     bar.finish_and_clear();
-    let frames = (args.frames.end - args.frames.start).max(1) as f64;
-    let gaussians = scene.avatar().gaussians();
-    println!("images of {:.0} of {gaussians} Gaussians in {}", drawn as f64 / frames, args.out.display());
-    print_far(far / frames);
+    out.finish()?;
+    println!(
+        "{drawn} frames of {} of {} Gaussians in {}",
+        gaussians / drawn.max(1),
+        scene.avatar().gaussians(),
+        args.out.display()
+    );
+    let cut = view.cut_off(&clip);
+    if cut > 0 {
+        println!("the person is cut off in {cut} of {} frames; move --eye back, or leave it out", clip.len());
+    }
+    print_far(far / drawn.max(1) as f64);
     Ok(())
 }
 
-/// Retargets a recorded motion to the avatar's skeleton.
-pub(super) fn motion(avatar: &Avatar, path: &Path) -> Result<PoseTrack> {
-    let ending = path.extension().map(|ending| ending.to_string_lossy().to_lowercase()).unwrap_or_default();
-    let clip = match ending.as_str() {
-        "bvh" => load_bvh(path)?.motion(),
-        "glb" | "gltf" => load_gltf_motion(path)?,
-        _ => bail!("{} is neither BVH nor glTF (*.bvh, *.glb, *.gltf)", path.display()),
-    };
-    let options = RetargetOptions { reach_m: Some(0.5), ..RetargetOptions::default() };
-    Ok(clip.retarget(&avatar.template.skeleton, &options)?)
+/// Destination of the frames.
+enum Output {
+    /// Folder of images with a transparent background.
+    Images(PathBuf),
+    /// Video on a floor.
+    Video { file: VideoFile, floor: Box<Floor> },
 }
 
-/// Returns the pose of a frame.
-pub(super) fn pose_at(track: &PoseTrack, frame: u64) -> Pose {
-    track.at((frame as f64 / FPS * 1e9) as i64)
-}
+impl Output {
+    /// Creates the folder or the video. `surface` casts the shadow.
+    fn create(path: &Path, [width, height]: [u32; 2], view: &View, surface: Template) -> Result<Self> {
+        let ending = path.extension().map(|ending| ending.to_string_lossy().to_lowercase()).unwrap_or_default();
+        match ending.as_str() {
+            "mp4" | "avi" => Ok(Self::Video {
+                floor: Box::new(Floor::new(view.target.truncate(), view.reach_m, surface)?),
+                file: VideoFile::create(path, (width, height))?,
+            }),
+            "mov" | "mkv" | "webm" | "m4v" | "png" | "jpg" | "jpeg" => bail!(
+                "--out {}: name a video *.mp4 or *.avi, or a folder, into which images are written as PNG",
+                path.display()
+            ),
+            _ => {
+                std::fs::create_dir_all(path).with_context(|| format!("cannot create {}", path.display()))?;
+                Ok(Self::Images(path.to_owned()))
+            }
+        }
+    }
 
-/// Returns a camera in front of the person.
-fn camera([width, height]: [u32; 2], root: DVec3) -> Camera {
-    let focal = 1.4 * f64::from(height);
-    let place = DVec3::new(root.x, root.y - AWAY_M, HEIGHT_M);
-    // The world has z up; a camera looks along its own z, with y down.
-    let camera_from_world = DQuat::from_rotation_x(std::f64::consts::FRAC_PI_2);
-    Camera {
-        id: "view".into(),
-        intrinsics: Intrinsics {
-            width,
-            height,
-            focal_px: DVec2::splat(focal),
-            // Pixel centres are at integers.
-            center_px: DVec2::new(f64::from(width) - 1.0, f64::from(height) - 1.0) * 0.5,
-            lens: Lens::PINHOLE,
-        },
-        camera_from_world: Isometry { rotation: camera_from_world, translation: -(camera_from_world * place) },
-        time_offset_nanos: 0,
-        color: Default::default(),
+    fn write(&mut self, frame: u64, pose: &Pose, camera: &Camera, view: &RenderedView) -> Result<()> {
+        match self {
+            Self::Images(folder) => png::write_view(&folder.join(format!("{frame:06}.png")), view),
+            Self::Video { file, floor } => file.write(&floor.paint(camera, view, pose), 0, nanos(frame)),
+        }
+    }
+
+    /// Completes a video.
+    fn finish(self) -> Result<()> {
+        match self {
+            Self::Images(_) => Ok(()),
+            Self::Video { file, .. } => file.finish(),
+        }
     }
 }

@@ -1,8 +1,10 @@
 //! `flyrig calibrate lens`: calibrates the lens of each camera separately.
 
-use anyhow::{Context as _, Result};
+use std::path::Path;
+
+use anyhow::{Context as _, Result, ensure};
 use clap::Args;
-use flyrig_calib::{Board, LensFit, calibrate_lens, save_lenses};
+use flyrig_calib::{Board, LensFit, calibrate_lens, load_lenses, save_lenses};
 use flyrig_gpu::GpuContext;
 use flyrig_report::stop;
 use flyrig_types::{CameraId, Intrinsics};
@@ -33,7 +35,8 @@ pub fn lens(args: &CalibrateLensArgs, gpu: &dyn Fn() -> Result<GpuContext>) -> R
     let board = load_board(&args.board.board, &args.take)?;
     refuse_existing(&args.target.out, &["calibration.toml"], args.target.force)?;
     let seen = SeenBoards::find(&args.take, &board, gpu)?;
-    let lenses = solve(&board, &seen)?;
+    let lenses = seen.ids.iter().zip(solve(&board, &seen)).map(|(id, lens)| Ok((id.clone(), lens?)));
+    let lenses = lenses.collect::<Result<Vec<(CameraId, Intrinsics)>>>()?;
     std::fs::create_dir_all(&args.target.out)
         .with_context(|| format!("cannot create {}", args.target.out.display()))?;
     save_lenses(&args.target.out, &lenses)?;
@@ -42,33 +45,73 @@ pub fn lens(args: &CalibrateLensArgs, gpu: &dyn Fn() -> Result<GpuContext>) -> R
     Ok(())
 }
 
-/// Calibrates the lens of every camera and prints the residuals.
-pub fn solve(board: &Board, seen: &SeenBoards) -> Result<Vec<(CameraId, Intrinsics)>> {
-    let mut lenses = Vec::new();
+/// Lenses of the cameras of a take.
+pub(super) struct Lenses {
+    /// One per camera; an error says what is missing.
+    pub by_slot: Vec<Result<Intrinsics>>,
+    /// Whether they were calibrated from the take.
+    pub are_new: bool,
+}
+
+impl Lenses {
+    /// Loads the lenses of a folder, or calibrates them from this take.
+    pub fn load_or_solve(folder: Option<&Path>, board: &Board, seen: &SeenBoards) -> Result<Self> {
+        let Some(folder) = folder else { return Ok(Self { by_slot: solve(board, seen), are_new: true }) };
+        let size = |id: &_| {
+            let slot = seen.ids.iter().position(|known| known == id)?;
+            seen.sizes[slot].map(|[width, height]| (width, height))
+        };
+        let known = load_lenses(folder, &size)?;
+        let of = |id: &CameraId| {
+            let found = known.iter().find(|(known, _)| known == id).map(|(_, intrinsics)| *intrinsics);
+            found.with_context(|| {
+                format!("camera {id} is not in {}; calibrate its lens, or leave --lenses out", folder.display())
+            })
+        };
+        let lenses = seen.ids.iter().map(of).collect::<Result<Vec<_>>>()?;
+        Ok(Self { by_slot: lenses.into_iter().map(Ok).collect(), are_new: false })
+    }
+
+    /// Returns all lenses.
+    ///
+    /// # Errors
+    /// What is missing for each camera without one.
+    pub fn all(&self) -> Result<Vec<Intrinsics>> {
+        let missing: Vec<String> =
+            self.by_slot.iter().filter_map(|lens| Some(format!("{:#}", lens.as_ref().err()?))).collect();
+        ensure!(missing.is_empty(), "{}", missing.join("; "));
+        Ok(self.by_slot.iter().flatten().copied().collect())
+    }
+}
+
+/// Calibrates the lens of every camera, in their order, and prints the residuals.
+fn solve(board: &Board, seen: &SeenBoards) -> Vec<Result<Intrinsics>> {
     println!(
         "{:<14} {:>6} {:>7} {:>9} {:>18} {:>16} {:>9}  lens",
         "camera", "boards", "rms px", "noise px", "focal px", "centre px", "covered"
     );
-    for (slot, id) in seen.ids.iter().enumerate() {
-        let views = seen.of_camera(slot);
-        let size = seen.sizes[slot].with_context(|| format!("camera {id}: no image"))?;
-        let fit = calibrate_lens(board, id, size, &views)?;
-        let (focal, center, [dx, dy, du, dv]) = (fit.intrinsics.focal_px, fit.intrinsics.center_px, fit.deviations_px);
-        println!(
-            "{:<14} {:>6} {:>7.3} {:>9.3} {:>18} {:>16} {:>8.0}%  {}",
-            id,
-            fit.views.len(),
-            fit.rms_px,
-            fit.sigma_px,
-            format!("{:.1} +-{:.1}", 0.5 * (focal.x + focal.y), dx.max(dy)),
-            format!("{:.0} {:.0} +-{:.1}", center.x, center.y, du.max(dv)),
-            100.0 * fit.coverage,
-            model(&fit)
-        );
-        advise(id, &fit);
-        lenses.push((id.clone(), fit.intrinsics));
-    }
-    Ok(lenses)
+    (0..seen.ids.len()).map(|slot| solve_camera(board, seen, slot)).collect()
+}
+
+fn solve_camera(board: &Board, seen: &SeenBoards, slot: usize) -> Result<Intrinsics> {
+    seen.check(slot, board)?;
+    let (id, views) = (&seen.ids[slot], seen.of_camera(slot));
+    let size = seen.sizes[slot].with_context(|| format!("camera {id}: no image"))?;
+    let fit = calibrate_lens(board, id, size, &views)?;
+    let (focal, center, [dx, dy, du, dv]) = (fit.intrinsics.focal_px, fit.intrinsics.center_px, fit.deviations_px);
+    println!(
+        "{:<14} {:>6} {:>7.3} {:>9.3} {:>18} {:>16} {:>8.0}%  {}",
+        id,
+        fit.views.len(),
+        fit.rms_px,
+        fit.sigma_px,
+        format!("{:.1} +-{:.1}", 0.5 * (focal.x + focal.y), dx.max(dy)),
+        format!("{:.0} {:.0} +-{:.1}", center.x, center.y, du.max(dv)),
+        100.0 * fit.coverage,
+        model(&fit)
+    );
+    advise(id, &fit);
+    Ok(fit.intrinsics)
 }
 
 /// Formats the lens model, and the error of each model on held-out views.

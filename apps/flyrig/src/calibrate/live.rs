@@ -19,9 +19,7 @@ use indicatif::{ProgressBar, ProgressStyle};
 
 use super::{
     advice::{CalibrationState, Step, different},
-    output::{FILES, refuse_existing},
-    page,
-    rig::{self, PAGE, RigTarget},
+    page, rig,
     views::{BoardTakeArgs, SeenBoards, open_frames},
 };
 use crate::arguments::{SolveArgs, TargetArgs};
@@ -63,7 +61,7 @@ const NEW_BOARDS: usize = 4;
 pub fn live(args: &CalibrateLiveArgs, gpu: &dyn Fn() -> Result<GpuContext>) -> Result<()> {
     stop::flag();
     let board = Board::load(&args.solve.board.board)?;
-    refuse_existing(&args.target.out, &[&FILES[..], &[PAGE]].concat(), args.target.force)?;
+    rig::refuse_calibrated(&args.target, &args.solve)?;
     let opened = open_frames(&args.take, gpu)?;
     let ids: Vec<CameraId> = opened.sources.iter().map(|source| source.camera().clone()).collect();
     ensure!(ids.len() > 1, "one camera alone is no rig; flyrig calibrate lens calibrates it");
@@ -74,11 +72,9 @@ pub fn live(args: &CalibrateLiveArgs, gpu: &dyn Fn() -> Result<GpuContext>) -> R
     watching.show.finish_and_clear();
     different(&seen.shots, watching.looked_at, &seen.sizes, &mut watching.shots);
     seen.shots = watching.shots;
-    seen.check(&board)?;
+    println!("{}", seen.looked);
     rig::check_floor(args.solve.floor, &seen)?;
-    let lenses = rig::lenses(args.solve.lenses.as_deref(), &board, &seen)?;
-    let target = RigTarget { out: &args.target.out, floor: args.solve.floor, no_offsets: args.solve.no_offsets };
-    rig::solve_and_write(&target, &board, &seen, &lenses, None)
+    rig::calibrate((&args.target.out, &args.solve), &board, &seen, None)
 }
 
 /// Calibration under way.

@@ -134,6 +134,32 @@ pub(super) fn live(progress: &CalibrationState<'_>, sentence: &str) -> Report {
     }
 }
 
+/// Builds the page of a rig whose cameras could not be joined. `sentence` says what is missing.
+pub(super) fn unjoined(progress: &CalibrationState<'_>, sentence: String) -> Report {
+    let live = live(progress, "");
+    Report {
+        title: format!("{} cameras that the boards do not join", progress.ids.len()),
+        refresh_secs: None,
+        sentences: vec![sentence],
+        tables: std::iter::once(shared(progress)).chain(live.tables).collect(),
+        drawings: live.drawings,
+        ..Report::default()
+    }
+}
+
+/// Returns the numbers of boards that each two cameras saw together.
+fn shared(progress: &CalibrationState<'_>) -> Table {
+    let ids = || progress.ids.iter().map(CameraId::to_string);
+    let cell = |a: usize, b: usize| if a == b { String::new() } else { progress.shared(a, b).to_string() };
+    let count = progress.ids.len();
+    let row = |(a, id): (usize, String)| std::iter::once(id).chain((0..count).map(|b| cell(a, b))).collect();
+    Table {
+        title: format!("Boards that two cameras saw together; {WELL_LINKED} or more join them well"),
+        head: std::iter::once(String::new()).chain(ids()).collect(),
+        rows: ids().enumerate().map(row).collect(),
+    }
+}
+
 /// Draws the cameras on a circle, joined by lines with the number of shared boards.
 fn links(progress: &CalibrationState<'_>) -> String {
     let count = progress.ids.len();

@@ -2,19 +2,18 @@
 
 use std::path::Path;
 
-use anyhow::{Context as _, Result, ensure};
+use anyhow::{Context as _, Result, bail, ensure};
 use clap::Args;
-use flyrig_calib::{Board, Deviation, LensModel, RigFit, RigOptions, calibrate_rig, load_lenses, save_calibration};
+use flyrig_calib::{Board, Deviation, LensModel, RigFit, RigOptions, calibrate_rig, save_calibration};
 use flyrig_gpu::GpuContext;
 use flyrig_report::{stop, write_whole};
-use flyrig_types::Intrinsics;
 use glam::DVec3;
 use serde_json::json;
 
 use super::{
-    lens,
-    output::{FILES, refuse_existing},
-    page,
+    lens::Lenses,
+    output::{FILES, LENSES, PAGE, refuse_existing},
+    page, unjoined,
     views::{BoardTakeArgs, SeenBoards, load_board},
 };
 use crate::arguments::{SolveArgs, TargetArgs};
@@ -33,8 +32,6 @@ pub struct CalibrateRigArgs {
     pub target: TargetArgs,
 }
 
-/// Name of the page about the calibration.
-pub(super) const PAGE: &str = "calibration.html";
 /// Ratio of the noise with and without time offsets below which they are kept.
 const OFFSETS_PAY: f64 = 0.95;
 /// Ratio of the noise with and without a bent board below which the bend is kept, and its least multiple of the standard deviation.
@@ -47,25 +44,26 @@ const MOST_TILT_DEG: f64 = 70.0;
 /// Largest difference between the halves of the shots, as a multiple of the noise.
 const MOST_DISAGREEMENT: f64 = 1.5;
 
-/// Destination of the results, and options of the solve.
-pub(super) struct RigTarget<'a> {
-    pub out: &'a Path,
-    pub floor: bool,
-    pub no_offsets: bool,
-}
-
 /// Runs the command.
 pub fn rig(args: &CalibrateRigArgs, gpu: &dyn Fn() -> Result<GpuContext>) -> Result<()> {
     stop::flag();
     let board = load_board(&args.solve.board.board, &args.take)?;
-    refuse_existing(&args.target.out, &[&FILES[..], &[PAGE]].concat(), args.target.force)?;
+    refuse_calibrated(&args.target, &args.solve)?;
     let seen = SeenBoards::find(&args.take, &board, gpu)?;
     ensure!(seen.ids.len() > 1, "one camera alone is no rig; flyrig calibrate lens calibrates it");
     check_floor(args.solve.floor, &seen)?;
-    let lenses = lenses(args.solve.lenses.as_deref(), &board, &seen)?;
     let refine = args.refine_lenses.then_some(LensModel::RadialTangential);
-    let target = RigTarget { out: &args.target.out, floor: args.solve.floor, no_offsets: args.solve.no_offsets };
-    solve_and_write(&target, &board, &seen, &lenses, refine)
+    calibrate((&args.target.out, &args.solve), &board, &seen, refine)
+}
+
+/// Refuses to replace a calibration, or lenses that a failed attempt would write, unless forced. The page of a failed attempt alone is
+/// replaced.
+pub(super) fn refuse_calibrated(target: &TargetArgs, solve: &SolveArgs) -> Result<()> {
+    refuse_existing(&target.out, &FILES, target.force)?;
+    match solve.lenses {
+        Some(_) => Ok(()),
+        None => refuse_existing(&target.out.join(LENSES), &FILES[..1], target.force),
+    }
 }
 
 /// Checks that a take with `--floor` begins with the board.
@@ -82,17 +80,47 @@ pub(super) fn check_floor(floor: bool, seen: &SeenBoards) -> Result<()> {
     Ok(())
 }
 
-/// Calibrates the poses, prints them, and writes all files.
-pub(super) fn solve_and_write(
-    args: &RigTarget<'_>,
+/// Calibrates lenses, where they are not known, and poses, and writes all files. Where the boards do not join all cameras, writes the
+/// lenses and a page about what is missing, and returns the error.
+pub(super) fn calibrate(
+    (out, args): (&Path, &SolveArgs),
     board: &Board,
     seen: &SeenBoards,
-    lenses: &[Intrinsics],
     refine: Option<LensModel>,
 ) -> Result<()> {
+    if seen.shots.is_empty() {
+        seen.check(0, board)?;
+    }
+    let lenses = Lenses::load_or_solve(args.lenses.as_deref(), board, seen)?;
+    match solve(args, board, seen, &lenses, refine) {
+        Ok(solved) => write(out, args.floor, seen, &solved),
+        Err(error) => {
+            let written = unjoined::write(out, seen, &lenses, &error)?;
+            bail!("{error:#}. {written}")
+        }
+    }
+}
+
+/// Solved rig.
+struct Solved {
+    fit: RigFit,
+    has_offsets: bool,
+    /// Noise without time offsets, pixels.
+    plain_px: f64,
+}
+
+/// Calibrates the poses.
+fn solve(
+    args: &SolveArgs,
+    board: &Board,
+    seen: &SeenBoards,
+    lenses: &Lenses,
+    refine: Option<LensModel>,
+) -> Result<Solved> {
+    let lenses = lenses.all()?;
     let solve = |lags, bend| {
         let options = RigOptions { lens: refine, lags, bend, floor_first: args.floor };
-        calibrate_rig(board, &seen.ids, lenses, &seen.shots, options)
+        calibrate_rig(board, &seen.ids, &lenses, &seen.shots, options)
     };
     let plain = solve(false, false)?;
     // Offsets are kept only if the board moved and they lower the noise.
@@ -100,7 +128,7 @@ pub(super) fn solve_and_write(
     let better = |fit: &RigFit| {
         fit.sigma_px < OFFSETS_PAY * plain.sigma_px && fit.cameras.iter().all(|camera| camera.deviation.is_some())
     };
-    let noise_before = plain.sigma_px;
+    let plain_px = plain.sigma_px;
     let (fit, has_offsets) = match with_offsets.filter(better) {
         Some(fit) => (fit, true),
         None => (plain, false),
@@ -109,23 +137,29 @@ pub(super) fn solve_and_write(
         bent.sigma_px < BEND_PAYS * fit.sigma_px && bent.bend_mm.is_some_and(|(mm, sigma)| mm > BEND_SIGMAS * sigma)
     };
     let fit = solve(has_offsets, true).ok().filter(is_bent).unwrap_or(fit);
+    Ok(Solved { fit, has_offsets, plain_px })
+}
+
+/// Prints the poses and writes all files.
+fn write(out: &Path, floor: bool, seen: &SeenBoards, solved: &Solved) -> Result<()> {
+    let Solved { fit, has_offsets, plain_px } = solved;
     let above =
         fit.rig.cameras.iter().map(|camera| camera.camera_from_world.rotation.inverse() * DVec3::NEG_Y).sum::<DVec3>();
     let tilt_deg = above.angle_between(fit.rig.world_up).to_degrees();
     ensure!(
-        !args.floor || tilt_deg < MOST_TILT_DEG,
+        !floor || tilt_deg < MOST_TILT_DEG,
         "--floor: the first board stands {tilt_deg:.0} degrees off what the cameras have above them; begin the take with the board on \
          the floor, face up"
     );
-    print(seen, &fit, has_offsets);
-    let sentences = sentences(seen, &fit, has_offsets.then_some(noise_before));
+    print(seen, fit, *has_offsets);
+    let sentences = sentences(seen, fit, has_offsets.then_some(*plain_px));
     sentences.iter().for_each(|sentence| println!("{sentence}"));
-    std::fs::create_dir_all(args.out).with_context(|| format!("cannot create {}", args.out.display()))?;
+    std::fs::create_dir_all(out).with_context(|| format!("cannot create {}", out.display()))?;
     let mut rig = fit.rig.clone();
     let mut deviations = Vec::new();
     for (camera, solved) in rig.cameras.iter_mut().zip(&fit.cameras) {
         let (lag_s, sigma_s) = solved.lag_s;
-        if has_offsets {
+        if *has_offsets {
             camera.time_offset_nanos = (1e9 * lag_s).round() as i64;
         }
         deviations.push(solved.deviation.map(|(rotation_deg, position_mm)| Deviation {
@@ -134,35 +168,16 @@ pub(super) fn solve_and_write(
             time_offset_ms: has_offsets.then_some(1e3 * sigma_s),
         }));
     }
-    save_calibration(args.out, &rig, &deviations)?;
-    write_whole(&args.out.join("calibration.json"), &serde_json::to_vec_pretty(&report(seen, &fit))?)?;
-    page::page(&seen.ids, &fit, sentences).save(&args.out.join(PAGE))?;
-    println!("{}: {}, {PAGE}", args.out.display(), FILES.join(", "));
+    save_calibration(out, &rig, &deviations)?;
+    write_whole(&out.join("calibration.json"), &serde_json::to_vec_pretty(&report(seen, fit))?)?;
+    page::page(&seen.ids, fit, sentences).save(&out.join(PAGE))?;
+    println!("{}: {}, {PAGE}", out.display(), FILES.join(", "));
     println!(
         "next: look at {}, set source.path = \"{}\" in the configuration, then flyrig doctor",
-        args.out.join(PAGE).display(),
-        args.out.display()
+        out.join(PAGE).display(),
+        out.display()
     );
     Ok(())
-}
-
-/// Loads the lenses of a folder, or calibrates them from this take.
-pub(super) fn lenses(folder: Option<&Path>, board: &Board, seen: &SeenBoards) -> Result<Vec<Intrinsics>> {
-    let Some(folder) = folder else {
-        return Ok(lens::solve(board, seen)?.into_iter().map(|(_, intrinsics)| intrinsics).collect());
-    };
-    let size = |id: &_| {
-        let slot = seen.ids.iter().position(|known| known == id)?;
-        seen.sizes[slot].map(|[width, height]| (width, height))
-    };
-    let known = load_lenses(folder, &size)?;
-    let of = |id| {
-        let found = known.iter().find(|(known, _)| known == id).map(|(_, intrinsics)| *intrinsics);
-        found.with_context(|| {
-            format!("camera {id} is not in {}; calibrate its lens, or leave --lenses out", folder.display())
-        })
-    };
-    seen.ids.iter().map(of).collect()
 }
 
 fn print(seen: &SeenBoards, fit: &RigFit, has_offsets: bool) {

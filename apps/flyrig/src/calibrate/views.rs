@@ -2,6 +2,7 @@
 
 use std::{
     collections::BTreeMap,
+    fmt,
     ops::ControlFlow,
     path::Path,
     time::{Duration, Instant},
@@ -14,7 +15,7 @@ use flyrig_fusion::{InputFormat, Intake};
 use flyrig_gpu::GpuContext;
 use flyrig_report::{arguments::parse_seconds, progress_bar, stop};
 use flyrig_sync::SyncSettings;
-use flyrig_takes::{Needs, Take, TakeOptions};
+use flyrig_takes::{Footage, Needs, Take, TakeOptions};
 use flyrig_types::{CameraId, FrameSet};
 use rayon::prelude::*;
 
@@ -26,14 +27,35 @@ use crate::{
 /// A take of a board, and the part that is used.
 #[derive(Debug, Args)]
 pub struct BoardTakeArgs {
-    /// Seconds of the input that are used.
-    #[arg(long, default_value_t = 120.0, value_parser = parse_seconds)]
-    pub secs: f64,
-    /// Time between used frame sets, milliseconds.
-    #[arg(long, default_value_t = 100.0, value_parser = parse_most_ms)]
-    pub every_ms: f64,
+    /// Seconds of the input that are used [default: all of a folder of images, 120 of anything else].
+    #[arg(long, value_parser = parse_seconds)]
+    pub secs: Option<f64>,
+    /// Time between used frame sets, milliseconds [default: every image of a folder, 100 of anything else].
+    #[arg(long, value_parser = parse_most_ms)]
+    pub every_ms: Option<f64>,
     #[command(flatten)]
     pub source: InputArgs,
+}
+
+/// Seconds of a take that is no folder of images, and time between its used frame sets, milliseconds.
+const USUAL_SECS: f64 = 120.0;
+const USUAL_EVERY_MS: f64 = 100.0;
+
+impl BoardTakeArgs {
+    /// Returns whether the input is a folder of images: somebody chose them, so each counts.
+    fn is_folder(&self) -> bool {
+        Footage::from_paths(&self.source.input).is_ok_and(|footage| footage.folder().is_some())
+    }
+
+    /// Returns the seconds that are used; infinity for all.
+    fn secs(&self) -> f64 {
+        self.secs.unwrap_or(if self.is_folder() { f64::INFINITY } else { USUAL_SECS })
+    }
+
+    /// Returns the time between used frame sets, milliseconds.
+    fn every_ms(&self) -> f64 {
+        self.every_ms.unwrap_or(if self.is_folder() { 0.0 } else { USUAL_EVERY_MS })
+    }
 }
 
 /// Number of images that are searched in parallel.
@@ -70,19 +92,48 @@ pub struct SeenBoards {
     pub images: Vec<usize>,
     /// Time of the first frame set, nanoseconds.
     pub begin_nanos: i64,
+    /// Part of the take that was searched.
+    pub looked: Looked,
+}
+
+/// Part of a take that was searched for boards.
+#[derive(Debug, Clone, Copy, Default)]
+pub struct Looked {
+    /// Number of frame sets that were searched, and of all until the end.
+    sets: [usize; 2],
+    every_ms: f64,
+    /// Seconds after which the search ended, if the take went on.
+    until_secs: Option<f64>,
+}
+
+impl fmt::Display for Looked {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        let [looked, all] = self.sets;
+        match looked == all {
+            true => write!(f, "looked at all {all} frame sets")?,
+            false => write!(f, "looked at {looked} of {all} frame sets, one per {} ms (--every-ms)", self.every_ms)?,
+        }
+        match self.until_secs {
+            Some(secs) => write!(f, " of the first {secs} s (--secs)"),
+            None => Ok(()),
+        }
+    }
 }
 
 impl SeenBoards {
-    /// Opens a take and detects the board, which every camera must see. `gpu` opens a graphics adapter, for simulated cameras alone.
+    /// Opens a take, detects the board and prints how much was searched. `gpu` opens a graphics adapter, for simulated cameras alone.
     pub fn find(args: &BoardTakeArgs, board: &Board, gpu: &dyn Fn() -> Result<GpuContext>) -> Result<Self> {
-        let bar = progress_bar((args.secs * 1e3) as u64, "boards, ms of the take");
+        let bar = progress_bar((args.secs() * 1e3) as u64, "boards, ms of the take");
+        if args.secs().is_infinite() {
+            bar.unset_length();
+        }
         let seen = Self::detect_all(open_frames(args, gpu)?, board, args, |seen, at| {
             bar.set_position((at * 1e3) as u64);
             bar.set_message(format!("{} boards", seen.shots.iter().map(|shot| shot.views.len()).sum::<usize>()));
             Ok(ControlFlow::Continue(()))
         })?;
         bar.finish_and_clear();
-        seen.check(board)?;
+        println!("{}", seen.looked);
         Ok(seen)
     }
 
@@ -93,12 +144,18 @@ impl SeenBoards {
         args: &BoardTakeArgs,
         mut each: impl FnMut(&Self, f64) -> Result<ControlFlow<()>>,
     ) -> Result<Self> {
-        let (secs, every_nanos) = (args.secs, args.every_ms * 1e6);
+        let (secs, every_ms) = (args.secs(), args.every_ms());
         let detector = detector(board).map_err(|reason| anyhow!(reason))?;
         let ids: Vec<CameraId> = take.sources.iter().map(|source| source.camera().clone()).collect();
         let count = ids.len();
-        let mut seen =
-            Self { ids, sizes: vec![None; count], shots: Vec::new(), images: vec![0; count], begin_nanos: 0 };
+        let mut seen = Self {
+            ids,
+            sizes: vec![None; count],
+            shots: Vec::new(),
+            images: vec![0; count],
+            begin_nanos: 0,
+            looked: Looked { every_ms, ..Looked::default() },
+        };
         let pacing = take.pacing();
         let mut intake = Intake::start_opening(take.sources, InputFormat::AnySize, &SyncSettings::default(), pacing)?;
         let started = Instant::now();
@@ -116,13 +173,16 @@ impl SeenBoards {
             seen.begin_nanos = from;
             let at = set.master_nanos.saturating_sub(from) as f64 * 1e-9;
             if at > secs {
+                seen.looked.until_secs = Some(secs);
                 break;
             }
+            seen.looked.sets[1] += 1;
             // Jitter may bring the right frame set slightly early.
             if set.master_nanos < next {
                 continue;
             }
-            next = set.master_nanos.saturating_add((0.9 * every_nanos) as i64);
+            next = set.master_nanos.saturating_add((0.9e6 * every_ms) as i64);
+            seen.looked.sets[0] += 1;
             batch.push(set);
             if batch.len() * count >= BATCH {
                 seen.detect(&batch, detector.as_ref())?;
@@ -186,23 +246,70 @@ impl SeenBoards {
         self.shots.iter().flat_map(|shot| &shot.views).filter(|view| view.camera == slot).cloned().collect()
     }
 
-    /// Checks that every camera saw the board.
-    pub fn check(&self, board: &Board) -> Result<()> {
-        for (slot, id) in self.ids.iter().enumerate() {
-            ensure!(
-                !self.of_camera(slot).is_empty(),
-                "camera {id}: no board in its {} images; check board.toml ({} x {} squares), light and focus, and show the whole \
-                 board{}",
-                self.images[slot],
-                board.columns,
-                board.rows,
-                match board.pattern {
-                    flyrig_calib::Pattern::Chessboard => "",
-                    flyrig_calib::Pattern::Charuco { .. } =>
-                        " (its dictionary and size of markers must be those of the print)",
-                }
-            );
-        }
+    /// Checks that a camera saw the board.
+    pub fn check(&self, slot: usize, board: &Board) -> Result<()> {
+        ensure!(
+            !self.of_camera(slot).is_empty(),
+            "camera {}: no board in its {} images; check board.toml ({} x {} squares), light and focus, and show the whole board{}",
+            self.ids[slot],
+            self.images[slot],
+            board.columns,
+            board.rows,
+            match board.pattern {
+                flyrig_calib::Pattern::Chessboard => "",
+                flyrig_calib::Pattern::Charuco { .. } =>
+                    " (its dictionary and size of markers must be those of the print)",
+            }
+        );
         Ok(())
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use std::path::PathBuf;
+
+    use flyrig_report::arguments::FpsArgs;
+    use image::{Rgb, RgbImage};
+
+    use super::*;
+    use crate::{arguments::InputArgs, video_file::VideoFile};
+
+    /// Searches a take without a board and says how much of it was looked at.
+    fn looked(input: &[PathBuf], secs: Option<f64>, every_ms: Option<f64>) -> String {
+        let board = Board { columns: 7, rows: 5, square_mm: 50.0, pattern: flyrig_calib::Pattern::Chessboard };
+        let source = InputArgs { input: input.to_vec(), rate: FpsArgs { fps: 30.0 } };
+        let args = BoardTakeArgs { secs, every_ms, source };
+        let take = open_frames(&args, &|| anyhow::bail!("no adapter is needed")).unwrap();
+        let seen = SeenBoards::detect_all(take, &board, &args, |_, _| Ok(ControlFlow::Continue(()))).unwrap();
+        assert!(seen.shots.is_empty());
+        assert!(seen.images.iter().all(|images| *images == seen.looked.sets[0]), "{:?}", seen.images);
+        seen.looked.to_string()
+    }
+
+    #[test]
+    fn every_image_of_a_folder_is_used_and_of_videos_the_part_is_said() {
+        let folder = tempfile::tempdir().unwrap();
+        let image = |i: u32| RgbImage::from_fn(64, 48, |x, y| Rgb([(x * y + 7 * i) as u8; 3]));
+        let mut videos = Vec::new();
+        for camera in ["a", "b"] {
+            let stills = folder.path().join("take/images").join(camera);
+            std::fs::create_dir_all(&stills).unwrap();
+            let path = folder.path().join(format!("{camera}.mp4"));
+            let mut video = VideoFile::create(&path, (64, 48)).unwrap();
+            for i in 0..60 {
+                image(i).save(stills.join(format!("{i:06}.png"))).unwrap();
+                video.write(&image(i), 0, i64::from(i) * 1_000_000_000 / 30).unwrap();
+            }
+            video.finish().unwrap();
+            videos.push(path);
+        }
+        let stills = [folder.path().join("take")];
+        assert_eq!(looked(&stills, None, None), "looked at all 60 frame sets");
+        assert_eq!(looked(&stills, None, Some(100.0)), "looked at 20 of 60 frame sets, one per 100 ms (--every-ms)");
+        let part = looked(&stills, Some(0.5), None);
+        assert_eq!(part, "looked at all 16 frame sets of the first 0.5 s (--secs)");
+        assert_eq!(looked(&videos, None, None), "looked at 20 of 60 frame sets, one per 100 ms (--every-ms)");
+        assert_eq!(looked(&videos, None, Some(4.0)), "looked at all 60 frame sets");
     }
 }

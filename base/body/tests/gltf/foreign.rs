@@ -1,6 +1,6 @@
 //! Additions of exporters and extensions of the format.
 
-use flyrig_body::{GltfHuman, RetargetOptions, Skeleton, Template, load_gltf_motion, skin_mesh};
+use flyrig_body::{GltfHuman, RetargetOptions, Template, load_gltf_motion, skin_mesh};
 use flyrig_types::PoseTrack;
 use glam::{DVec3, Mat4, Vec3};
 use serde_json::{Value, json};
@@ -380,12 +380,12 @@ fn an_animation_that_stands_still_is_not_preferred() {
 
 #[test]
 fn a_skeleton_without_a_body_has_a_motion() {
-    let skeleton: Skeleton = flyrig_body::default_template(&flyrig_body::ShapeParams::man()).unwrap().skeleton;
+    let body: Template = flyrig_body::default_template(&flyrig_body::ShapeParams::man()).unwrap();
     let folder = tempfile::tempdir().unwrap();
     let path = folder.path().join("walk.glb");
     let track = |file: &File| {
         std::fs::write(&path, file.glb()).unwrap();
-        load_gltf_motion(&path).and_then(|motion| motion.retarget(&skeleton, &RetargetOptions::default()))
+        load_gltf_motion(&path).and_then(|motion| motion.retarget(&body, &RetargetOptions::default()))
     };
     let whole = human("mixamorig:");
     let mut bare = whole.clone();
@@ -394,7 +394,7 @@ fn a_skeleton_without_a_body_has_a_motion() {
     bare.json["nodes"].as_array_mut().unwrap().truncate(12);
     let (whole, bare_track) = (track(&whole).unwrap(), track(&bare).unwrap());
     for nanos in [0, 400_000_000, 1_000_000_000] {
-        let worlds = [&whole, &bare_track].map(|track| skeleton.world_from_joint(&track.at(nanos)));
+        let worlds = [&whole, &bare_track].map(|track| body.skeleton.world_from_joint(&track.at(nanos)));
         for (a, b) in worlds[0].iter().zip(&worlds[1]) {
             let off: DVec3 = a.w_axis.truncate() - b.w_axis.truncate();
             assert!(off.length() < 1e-4, "{off} at {nanos} ns");

@@ -266,10 +266,11 @@ pub fn human(prefix: &str) -> File {
 
 #[test]
 fn a_rigs_motion_arrives_on_our_body() {
-    let skeleton = flyrig_body::default_template(&flyrig_body::ShapeParams::woman()).unwrap().skeleton;
+    let body = flyrig_body::default_template(&flyrig_body::ShapeParams::woman()).unwrap();
+    let skeleton = &body.skeleton;
     for prefix in ["mixamorig:", "", "MyRig:mixamorig:"] {
         let motion = human(prefix).load().unwrap().motion().unwrap();
-        let track = motion.retarget(&skeleton, &flyrig_body::RetargetOptions::default()).unwrap();
+        let track = motion.retarget(&body, &flyrig_body::RetargetOptions::default()).unwrap();
         let world = |nanos: i64| skeleton.world_from_joint(&track.at(nanos));
         let place = |nanos: i64, name: &str| world(nanos)[skeleton.joint(name).unwrap()].w_axis.truncate();
         let bone = |nanos: i64, from: &str, to: &str| (place(nanos, to) - place(nanos, from)).normalize();
@@ -288,7 +289,7 @@ fn a_rigs_motion_arrives_on_our_body() {
         node["name"] = json!(format!("bone {number}"));
     }
     let unknown = unknown.load().unwrap().motion().unwrap();
-    let error = unknown.retarget(&skeleton, &flyrig_body::RetargetOptions::default()).unwrap_err().to_string();
+    let error = unknown.retarget(&body, &flyrig_body::RetargetOptions::default()).unwrap_err().to_string();
     assert!(error.contains("'LeftUpLeg', 'LeftLeg', 'LeftFoot', 'RightUpLeg'"), "{error}");
     let mut still = human("");
     still.json.as_object_mut().unwrap().remove("animations");

@@ -3,7 +3,9 @@
 
 use std::{cell::RefCell, fs, path::Path, time::Duration};
 
-use flyrig_body::{BodyError, Joint, MotionClip, RetargetOptions, Skeleton, load_gltf, load_gltf_motion, parse_bvh};
+use flyrig_body::{
+    BodyError, Joint, MotionClip, RetargetOptions, Skeleton, Template, load_gltf, load_gltf_motion, parse_bvh,
+};
 use flyrig_calib::load_easymocap;
 use flyrig_capture::{
     CameraSource as _, FolderOptions, FolderReplay, McapReplay, RecordedCamera, foreign_cameras, recorded_notes,
@@ -281,7 +283,7 @@ fn stream(input: &[u8]) -> Result<String, String> {
 
 /// Parses BVH text or a binary glTF file and transfers its motion to a skeleton of the legs.
 fn motion(input: &[u8]) -> Result<String, String> {
-    let retarget = |clip: MotionClip| clip.retarget(&legs()?, &RetargetOptions::default());
+    let retarget = |clip: MotionClip| clip.retarget(&Template::empty("legs", legs()?), &RetargetOptions::default());
     if input.starts_with(b"glTF") {
         return with_files(&[("body.glb", input)], |root| {
             let path = root.join("body.glb");
