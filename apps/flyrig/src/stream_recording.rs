@@ -18,7 +18,7 @@ use flyrig_stream::{Stamp, restamp, stamp_of, template_hash};
 use flyrig_takes::recorded::recorded_cameras;
 use flyrig_transport::{Interests, PersonMessage, Publisher, Subscriber, TransportConfig};
 
-use crate::{config::RecordSection, recording, watch::WatchArgs};
+use crate::{config::RecordSection, opening::require_recording, recording, watch::WatchArgs};
 
 /// Arguments of `flyrig play`.
 #[derive(Debug, Args)]
@@ -153,6 +153,12 @@ pub fn record(args: &WatchArgs, path: &Path) -> Result<()> {
     if let Some(problem) = recorded.problem {
         anyhow::bail!("the recording broke off after {motions} frames: {problem}");
     }
+    ensure!(
+        motions > 0,
+        "nobody was received in {:.0} s, so {} holds no frame of people: wait until the rig has tracked a person",
+        started.elapsed().as_secs_f64(),
+        path.display()
+    );
     eprintln!("watch: recorded {motions} frames of people, {:.1} MB in {}", bytes as f64 / 1e6, path.display());
     Ok(())
 }
@@ -160,6 +166,7 @@ pub fn record(args: &WatchArgs, path: &Path) -> Result<()> {
 /// Runs `flyrig play`.
 pub fn play(args: &PlayArgs) -> Result<()> {
     let stop = stop::flag();
+    require_recording(&args.recording, "play")?;
     let rig = recorded_cameras(&args.recording)?.rig.with_context(|| {
         format!("{} has no calibration; record it with flyrig watch --record", args.recording.display())
     })?;

@@ -53,6 +53,7 @@ pub fn open_frames(args: &BoardTakeArgs, gpu: &dyn Fn() -> Result<GpuContext>) -
 /// # Errors
 /// Names the take, and the board's file with what is wrong in it.
 pub fn load_board(board: &Path, take: &BoardTakeArgs) -> Result<Board> {
+    take.source.require_files()?;
     Board::load(board).with_context(|| {
         let inputs: Vec<_> = take.source.input.iter().map(|path| path.display().to_string()).collect();
         format!("cannot search {} for a board", inputs.join(", "))
