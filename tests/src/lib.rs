@@ -2,6 +2,7 @@
 
 mod command;
 mod dataset;
+pub mod guide;
 mod running;
 
 pub use command::{Finished, run};

@@ -103,7 +103,7 @@ fn an_avatar_is_built_scored_driven_and_exported() {
     refused(&["export", "a.flyavatar", "--out", "a.ply", "--mesh"], "name the file a.glb");
     refused(&["export", "a.flyavatar", "--out", "a.obj"], "a.obj is neither");
     assert!(!folder.path().join("no.flyavatar").exists());
-    refused(&["info", "nowhere.flyavatar"], "nowhere.flyavatar: No such file");
+    refused(&["info", "nowhere.flyavatar"], "nowhere.flyavatar does not exist; `flyrig avatar build` makes an avatar");
     refused(&["render", "a.flyavatar", "--motion", "a.png", "--out", "r"], "a.png is neither BVH nor glTF");
     refused(
         &[&["build", &take, "--inputs", "00,02", "--out", "no/folder/a.flyavatar"], &GIVEN[..]].concat(),

@@ -24,19 +24,6 @@ pub struct InputArgs {
     pub rate: FpsArgs,
 }
 
-impl InputArgs {
-    /// Checks that every file and folder of the input exists.
-    ///
-    /// # Errors
-    /// Names the first that does not.
-    pub fn require_files(&self) -> Result<()> {
-        for path in &self.input {
-            ensure!(path.exists(), "{} does not exist", path.display());
-        }
-        Ok(())
-    }
-}
-
 /// Part of the input that is used.
 #[derive(Debug, Clone, Args)]
 pub struct SpanArgs {

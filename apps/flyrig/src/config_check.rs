@@ -19,7 +19,8 @@ use crate::config::Config;
 /// Names everything that is missing or wrong, one line each.
 pub fn check(path: &Path, offline: bool) -> Result<()> {
     let config = Config::load_for_capture(path)?;
-    let scene = config.check_scene();
+    // Cameras are configured before they are calibrated.
+    let scene = config.check_scene().and_then(|()| if offline { Ok(()) } else { require_calibration(&config, path) });
     let name = path.display();
     if !offline {
         let problems = problems(&config, scene.is_ok());
@@ -33,6 +34,18 @@ pub fn check(path: &Path, offline: bool) -> Result<()> {
         Ok(()) => println!("{name} is right"),
         Err(error) => println!("{name} is right for `flyrig capture` and `flyrig doctor` alone: {error}"),
     }
+    Ok(())
+}
+
+/// Checks that the cameras of this computer have been calibrated.
+fn require_calibration(config: &Config, path: &Path) -> Result<()> {
+    let source = &config.source;
+    let folder = source.calibration_folder().unwrap_or(&source.path).display();
+    ensure!(
+        source.kind != SourceKind::Cameras || source.has_calibration(),
+        "{folder} holds no calibration yet; make one with `flyrig calibrate live {} --out {folder}`",
+        path.display()
+    );
     Ok(())
 }
 
@@ -77,12 +90,8 @@ fn check_person(path: &Path) -> Result<()> {
 /// Tries the addresses that the configuration listens on, and reads the keys.
 fn address_checks(config: &Config) -> Vec<Result<()>> {
     let transport = &config.transport;
-    // The rig receives its cameras from other computers, and listens for viewers all the same.
     let mut checks: Vec<Result<()>> = Vec::new();
-    for endpoint in &transport.listen {
-        let address = endpoint.strip_prefix("tcp/").and_then(|address| address.split(['#', '?']).next());
-        checks.extend(address.map(|address| check_address("transport.listen", address)));
-    }
+    checks.extend(transport.listen.iter().map(|endpoint| check_endpoint("transport.listen", endpoint)));
     if !transport.keys.as_os_str().is_empty() {
         checks.push(check_keys(config));
     }
@@ -127,15 +136,25 @@ fn check_keys(config: &Config) -> Result<()> {
     Ok(())
 }
 
+/// Listens on a zenoh endpoint for a moment, if it is one of TCP; `key` names the setting.
+///
+/// # Errors
+/// The address is taken, or is none of this computer's.
+pub fn check_endpoint(key: &str, endpoint: &str) -> Result<()> {
+    let address = endpoint.strip_prefix("tcp/").and_then(|address| address.split(['#', '?']).next());
+    address.map_or(Ok(()), |address| check_address(key, address))
+}
+
 /// Listens on an address for a moment.
 fn check_address(key: &str, address: &str) -> Result<()> {
     let addresses: Vec<_> = address
         .to_socket_addrs()
         .with_context(|| format!("{key}: {address} is no address of this computer; write HOST:PORT"))?
         .collect();
-    TcpListener::bind(addresses.as_slice()).map(|_| ()).with_context(|| {
-        format!(
-            "{key}: cannot listen on {address}; end the program that uses it (another flyrig?), or name another port"
-        )
-    })
+    match TcpListener::bind(addresses.as_slice()) {
+        Ok(_) => Ok(()),
+        Err(error) => bail!(
+            "{key}: cannot listen on {address}: {error}; end the program that uses it (another flyrig?), or name another port"
+        ),
+    }
 }

@@ -34,18 +34,15 @@ pub fn open_cameras(config: &Config, needs: Needs, gpu: Option<&GpuContext>) -> 
     Take::open(&input, &TakeOptions { needs, ..TakeOptions::default() }, &gpu)
 }
 
-/// Checks that a path is a file, and neither a folder nor a configuration, before it is read as a recording; `command` reads it.
+/// Checks that a path is a file, and neither a folder nor a configuration, before it is read as a recording. `read` says what is read by
+/// which command, and `instead` which command reads a folder.
 ///
 /// # Errors
-/// Says what is there, and which command reads it.
-pub fn require_recording(path: &Path, command: &str) -> Result<()> {
+/// Says what is there, and what to use.
+pub fn require_recording(path: &Path, read: &str, instead: &str) -> Result<()> {
     let name = path.display();
-    ensure!(path.exists(), "{name} does not exist; flyrig {command} reads a recording (*.mcap)");
-    ensure!(
-        !path.is_dir(),
-        "{name} is a folder; flyrig {command} reads a recording (*.mcap). Score a folder with `flyrig eval {name}`, or run the \
-         rig on it: source.kind = \"folder\" and `flyrig run`"
-    );
+    ensure!(path.exists(), "{name} does not exist; {read}");
+    ensure!(!path.is_dir(), "{name} is a folder; {read}. {instead}");
     let is_config = path.extension().is_some_and(|ending| ending.eq_ignore_ascii_case("toml"));
     ensure!(!is_config, "{name} is no recording but a configuration; run it with `flyrig run {name}`");
     Ok(())

@@ -36,7 +36,14 @@ pub struct ReplayArgs {
 /// Runs the command.
 pub fn replay(args: &ReplayArgs) -> Result<()> {
     stop::flag();
-    require_recording(&args.recording, "replay")?;
+    let folder = args.recording.display();
+    require_recording(
+        &args.recording,
+        "flyrig replay reads a recording (*.mcap)",
+        &format!(
+            "Score a folder with `flyrig eval {folder}`, or run the rig on it: source.kind = \"folder\" and `flyrig run`"
+        ),
+    )?;
     let recorded = recorded_cameras(&args.recording)?;
     recorded.log_notes(&args.recording);
     let RecordedCameras { ids, rig, lenses, .. } = recorded;

@@ -76,7 +76,8 @@ impl TakeConfig {
     /// Names a file, camera or setting that is missing or wrong.
     pub fn check(&self) -> Result<()> {
         let rig = if self.source.kind == SourceKind::Sim {
-            dataset::select_cameras(&camera_ring(&self.sim)?, &self.source.names(), "the simulated rig")?
+            dataset::select_cameras(&camera_ring(&self.sim)?, &self.source.names(), "the simulated rig")
+                .context("source.cameras ([] takes all)")?
         } else {
             let rig = self.load_rig()?;
             self.open_stored(&rig)?;
@@ -95,7 +96,8 @@ impl TakeConfig {
         // An estimator starts without knowledge of the person.
         let knows_shape = self.perception.shape() == Origin::Given;
         let template = if knows_shape { template } else { default_template(&ShapeParams::default())? };
-        let rig = dataset::select_cameras(&rig, &self.source.names(), "the simulated rig")?;
+        let rig = dataset::select_cameras(&rig, &self.source.names(), "the simulated rig")
+            .context("source.cameras ([] takes all)")?;
         let plates = simulated_plates(&simulator, &rig)?;
         let simulator = Arc::new(Mutex::new(simulator));
         let time = if self.source.real_time { SimTime::Real } else { SimTime::Exact };
@@ -158,7 +160,7 @@ impl TakeConfig {
                 }
             }
         };
-        dataset::select_cameras(&rig, &source.names(), "the calibration")
+        dataset::select_cameras(&rig, &source.names(), "the calibration").context("source.cameras ([] takes all)")
     }
 
     /// Opens one source per camera of the rig, and returns the threads that they need.

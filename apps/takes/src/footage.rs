@@ -12,6 +12,17 @@ use crate::{dataset, recorded::recorded_cameras};
 pub(crate) const INPUTS: &str =
     "a configuration (*.toml), a recording (*.mcap), a folder with images/CAM, or the videos of all cameras";
 
+/// Checks that every input of a command line exists.
+///
+/// # Errors
+/// Names the first that does not, and what may stand there.
+pub fn require_inputs(paths: &[PathBuf]) -> Result<()> {
+    for path in paths {
+        ensure!(path.exists(), "{} does not exist; name {INPUTS}", path.display());
+    }
+    Ok(())
+}
+
 /// Stored images of several cameras.
 ///
 /// ```
@@ -52,9 +63,7 @@ impl Footage {
     /// # Errors
     /// Names a path that does not exist, or a folder among videos.
     pub fn from_paths(paths: &[PathBuf]) -> Result<Self> {
-        for path in paths {
-            ensure!(path.exists(), "{} does not exist; name {INPUTS}", path.display());
-        }
+        require_inputs(paths)?;
         match paths {
             [path] if has_ending(path, "mcap") || path.is_dir() => Ok(Self::from_dataset(path)),
             videos => {
@@ -74,7 +83,8 @@ impl Footage {
         match self {
             Self::Folder(root) => dataset::require_folder(
                 root,
-                "a folder with a calibration and images/CAM, or a recording (*.mcap); `flyrig record` makes one of videos",
+                "a folder with a calibration and images/CAM, or a recording (*.mcap); `flyrig record` makes one of \
+                 videos (source.kind = \"video\")",
             ),
             Self::Recording(path) => {
                 ensure!(path.exists(), "{} does not exist; name a recording of `flyrig record`", path.display());

@@ -25,7 +25,7 @@ mod truth;
 pub use avatar_stream::encode_avatar;
 pub use avatar_take::AvatarTake;
 pub use configured::{TakeConfig, simulated_plates};
-pub use footage::{Footage, OpenFootage};
+pub use footage::{Footage, OpenFootage, require_inputs};
 pub use known_avatar::{KnownBody, known_body};
 pub use network::host_clock;
 pub use open::{TakeInput, TakeOptions};
