@@ -435,6 +435,23 @@ mod tests {
     }
 
     #[test]
+    fn paths_are_relative_to_the_file_and_names_are_none() {
+        let folder = tempfile::tempdir().unwrap();
+        let rig = folder.path().join("rig.toml");
+        let text = "[body]\navatar = \"anna.flyavatar\"\n[transport]\nkeys = \"keys\"\n[web]\nkey = \"/etc/key.pem\"\n\
+                    [appearance]\nweights = \"tiny\"\n[sim.motion]\nbvh = \"walk.bvh\"\n";
+        std::fs::write(&rig, text).unwrap();
+        let config = Config::load(&rig).unwrap();
+        let at = |name: &str| folder.path().join(name);
+        assert_eq!((&config.body.avatar, &config.transport.keys), (&at("anna.flyavatar"), &at("keys")));
+        assert_eq!((config.sim.motion.bvh, config.web.key.as_path()), (Some(at("walk.bvh")), Path::new("/etc/key.pem")));
+        assert_eq!(config.appearance.weights.as_deref(), Some(Path::new("tiny")));
+        assert!(config.source.path.as_os_str().is_empty() && config.perception.plates.as_os_str().is_empty());
+        std::fs::write(&rig, text.replace("tiny", "mine.safetensors")).unwrap();
+        assert_eq!(Config::load(&rig).unwrap().appearance.weights, Some(at("mine.safetensors")));
+    }
+
+    #[test]
     fn the_simulators_file_is_read_and_checked_with_the_configuration() {
         let folder = tempfile::tempdir().unwrap();
         let (rig, sim) = (folder.path().join("rig.toml"), folder.path().join("sim.toml"));
