@@ -109,11 +109,44 @@ fn supplies() -> &'static Path {
         done(folder.path(), &[&convert[..], &["calibration"]].concat());
         done(folder.path(), &[&convert[..], &["nerf", "--to", "nerfstudio"]].concat());
         fs::rename(at("nerf/transforms.json"), at("transforms.json")).unwrap();
-        fs::copy(root().join("tests/corpus/motion/walk.bvh"), at("walk.bvh")).unwrap();
+        fs::write(at("walk.bvh"), walk_bvh()).unwrap();
         fs::remove_file(at("sim.toml")).unwrap();
         folder
     });
     folder.path()
+}
+
+/// Returns a motion of four frames, in which the thighs swing; lengths in centimetres.
+fn walk_bvh() -> String {
+    let end = |offset: &str| format!("End Site {{ OFFSET {offset} }}\n");
+    let joint = |name: &str, offset: &str, children: &str| {
+        let channels = "CHANNELS 3 Zrotation Xrotation Yrotation";
+        format!("JOINT {name} {{ OFFSET {offset} {channels}\n{children} }}\n")
+    };
+    let leg = |side: &str, x: f64| {
+        let foot = joint(&format!("{side}Foot"), "0 -42 0", &end("0 -7 14"));
+        let shin = joint(&format!("{side}Leg"), "0 -42 0", &foot);
+        joint(&format!("{side}UpLeg"), &format!("{x} -4 0"), &shin)
+    };
+    let arm = |side: &str, sign: f64| {
+        let hand = joint(&format!("{side}Hand"), &format!("{} 0 0", 25.0 * sign), &end("8 0 0"));
+        let lower = joint(&format!("{side}ForeArm"), &format!("{} 0 0", 28.0 * sign), &hand);
+        joint(&format!("{side}Arm"), &format!("{} 18 0", 17.0 * sign), &lower)
+    };
+    let head = joint("Neck", "0 24 0", &joint("Head", "0 9 0", &end("0 20 0")));
+    let spine = joint("Spine", "0 12 0", &joint("Spine1", "0 20 0", &(head + &arm("Left", 1.0) + &arm("Right", -1.0))));
+    let joints = spine + &leg("Left", 9.0) + &leg("Right", -9.0);
+    let channels = "CHANNELS 6 Xposition Yposition Zposition Zrotation Xrotation Yrotation";
+    let mut text = format!(
+        "HIERARCHY\nROOT Hips {{ OFFSET 0 0 0 {channels}\n{joints} }}\nMOTION\nFrames: 4\nFrame Time: 0.0333\n"
+    );
+    let rows = 3 * (joints.matches("JOINT").count() - 6);
+    for frame in 0..4 {
+        let swing = 10.0 * f64::from(frame);
+        let thigh = |angle: f64| format!("0 {angle} 0 0 0 0 0 0 0");
+        text += &format!("0 95 {swing} 0 0 0{} {} {}\n", " 0".repeat(rows), thigh(swing), thigh(-swing));
+    }
+    text
 }
 
 /// Runs a command that must succeed.

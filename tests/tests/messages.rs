@@ -128,7 +128,8 @@ fn mistakes_are_answered_as_the_table_states() {
     assert!(table.len() >= 20, "{} rows", table.len());
     let mut wrong = Vec::new();
     for Mistake { command, answer: expected } in &table {
-        let args: Vec<String> = command[1..].iter().map(|word| word.replace("FREE", &inputs.free.to_string())).collect();
+        let args: Vec<String> =
+            command[1..].iter().map(|word| word.replace("FREE", &inputs.free.to_string())).collect();
         let finished = inputs.run_in("", &args.iter().map(String::as_str).collect::<Vec<_>>());
         let found = answer(&finished).replace(&inputs.port().to_string(), "PORT");
         let found = found.replace(&inputs.free.to_string(), "FREE");
@@ -172,7 +173,8 @@ fn a_configuration_without_its_calibration_yet_and_one_with_two_faults() {
     inputs.write("two.toml", &format!("{text}keys = \"studio-keys\"\n"));
     let checked = inputs.run_in("", &["config", "check", "two.toml"]);
     assert_eq!(checked.code, Some(1), "{checked:?}");
-    for part in ["error: 2 problems in the configuration two.toml", "tkae does not exist", "studio-keys does not exist"] {
+    for part in ["error: 2 problems in the configuration two.toml", "tkae does not exist", "studio-keys does not exist"]
+    {
         assert!(checked.stderr.contains(part), "{checked:?}");
     }
     assert_eq!(inputs.run_in("", &["config", "check", "--offline", "two.toml"]).code, Some(0));

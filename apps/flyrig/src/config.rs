@@ -444,7 +444,10 @@ mod tests {
         let config = Config::load(&rig).unwrap();
         let at = |name: &str| folder.path().join(name);
         assert_eq!((&config.body.avatar, &config.transport.keys), (&at("anna.flyavatar"), &at("keys")));
-        assert_eq!((config.sim.motion.bvh, config.web.key.as_path()), (Some(at("walk.bvh")), Path::new("/etc/key.pem")));
+        assert_eq!(
+            (config.sim.motion.bvh, config.web.key.as_path()),
+            (Some(at("walk.bvh")), Path::new("/etc/key.pem"))
+        );
         assert_eq!(config.appearance.weights.as_deref(), Some(Path::new("tiny")));
         assert!(config.source.path.as_os_str().is_empty() && config.perception.plates.as_os_str().is_empty());
         std::fs::write(&rig, text.replace("tiny", "mine.safetensors")).unwrap();
