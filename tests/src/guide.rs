@@ -6,7 +6,7 @@
 
 /// Programs whose names begin a line of a block of commands.
 const PROGRAMS: [&str; 8] = ["flyrig", "make", "cargo", "sudo", "ffmpeg", "curl", "pkill", "journalctl"];
-/// Programs that begin a mark.
+/// Beginning of a mark.
 const MARK: &str = "<!-- not run";
 
 /// Part of a page that is set as code.

@@ -13,7 +13,7 @@ use std::{
 };
 
 use flyrig_tests::{
-    Running,
+    Running, copy_folder,
     guide::{Block, blocks},
     run,
 };
@@ -155,18 +155,6 @@ fn done(folder: &Path, args: &[&str]) {
     assert_eq!(finished.code, Some(0), "flyrig {}\n{}{}", args.join(" "), finished.stdout, finished.stderr);
 }
 
-fn copy_all(from: &Path, to: &Path) {
-    fs::create_dir_all(to).unwrap();
-    for entry in fs::read_dir(from).unwrap() {
-        let (path, name) = entry.map(|entry| (entry.path(), entry.file_name())).unwrap();
-        if path.is_dir() {
-            copy_all(&path, &to.join(name));
-        } else {
-            fs::copy(&path, to.join(name)).unwrap();
-        }
-    }
-}
-
 /// Reader of one page, in a folder of their own.
 struct Reader {
     folder: tempfile::TempDir,
@@ -180,7 +168,7 @@ struct Reader {
 impl Reader {
     fn new(page: &str) -> Self {
         let folder = tempfile::tempdir().unwrap();
-        copy_all(supplies(), folder.path());
+        copy_folder(supplies(), folder.path()).unwrap();
         let cameras = "cameras = [\"00\", \"03\"]";
         let endpoint = support::small_rig("flyrig", folder.path(), "");
         // Recordings of these pages are scored against cameras that are held out, and people are found in their images.

@@ -7,7 +7,7 @@ use std::{
     path::{Path, PathBuf},
 };
 
-use flyrig_tests::{Finished, guide::words, run};
+use flyrig_tests::{Finished, copy_folder, guide::words, run};
 
 const PROGRAM: &str = env!("CARGO_BIN_EXE_flyrig-under-test");
 
@@ -41,21 +41,9 @@ fn answer(finished: &Finished) -> String {
 
 fn copy_without(take: &Path, name: &str, missing: &[&str]) {
     let to = take.with_file_name(name);
-    copy_all(take, &to);
+    copy_folder(take, &to).unwrap();
     for path in missing.iter().map(|path| to.join(path)) {
         if path.is_dir() { fs::remove_dir_all(path).unwrap() } else { fs::remove_file(path).unwrap() }
-    }
-}
-
-fn copy_all(from: &Path, to: &Path) {
-    fs::create_dir_all(to).unwrap();
-    for entry in fs::read_dir(from).unwrap().map(|entry| entry.unwrap()) {
-        let target = to.join(entry.file_name());
-        if entry.path().is_dir() {
-            copy_all(&entry.path(), &target);
-        } else {
-            fs::copy(entry.path(), target).unwrap();
-        }
     }
 }
 
