@@ -1,6 +1,9 @@
 //! Small simulated data set in EasyMocap layout.
 
-use std::path::PathBuf;
+use std::{
+    fs,
+    path::{Path, PathBuf},
+};
 
 use anyhow::Result;
 use flyrig_gpu::{AdapterChoice, GpuContext};
@@ -62,4 +65,21 @@ pub fn write_dataset_of(seed: u64) -> Result<Dataset> {
     let root = folder.path().join("data");
     export(&mut simulator, &root, ExportOptions { frames: FRAMES, truth: false }, &mut |_| true)?;
     Ok(Dataset { root, folder })
+}
+
+/// Copies a folder with all that is in it into another one, which need not exist.
+///
+/// # Errors
+/// A file cannot be read or written.
+pub fn copy_folder(from: &Path, to: &Path) -> Result<()> {
+    fs::create_dir_all(to)?;
+    for entry in fs::read_dir(from)? {
+        let (path, target) = entry.map(|entry| (entry.path(), to.join(entry.file_name())))?;
+        if path.is_dir() {
+            copy_folder(&path, &target)?;
+        } else {
+            fs::copy(&path, &target)?;
+        }
+    }
+    Ok(())
 }

@@ -2,8 +2,9 @@
 
 mod command;
 mod dataset;
+pub mod guide;
 mod running;
 
 pub use command::{Finished, run};
-pub use dataset::{Dataset, FRAMES, SIDE, write_dataset, write_dataset_of};
+pub use dataset::{Dataset, FRAMES, SIDE, copy_folder, write_dataset, write_dataset_of};
 pub use running::Running;

@@ -116,7 +116,7 @@ fn an_avatar_is_built_scored_driven_and_exported() {
     refused(&["export", "a.flyavatar", "--out", "a.ply", "--mesh"], "name the file a.glb");
     refused(&["export", "a.flyavatar", "--out", "a.obj"], "a.obj is neither");
     assert!(!folder.path().join("no.flyavatar").exists());
-    refused(&["info", "nowhere.flyavatar"], "nowhere.flyavatar: No such file");
+    refused(&["info", "nowhere.flyavatar"], "nowhere.flyavatar does not exist; `flyrig avatar build` makes an avatar");
     refused(&["render", "a.flyavatar", "--motion", "a.png", "--out", "r"], "a.png is neither BVH nor glTF");
     refused(&["render", "a.flyavatar", "--motion", "wlk", "--out", "r"], "one of still, turn, walk, wave, squat,");
     let past = |more: &[&str]| {

@@ -25,7 +25,7 @@ fn a_recording_is_replayed_to_the_bit_and_exported() {
     assert!(recorded.stdout.starts_with("record: 12 frames"), "{}", recorded.stdout);
     let again = command(&["record", "rig.toml", "--out", "take.mcap"]);
     assert_eq!(again.code, Some(1), "a recording must not be overwritten");
-    assert!(again.stderr.contains("take.mcap cannot be recorded to"), "{}", again.stderr);
+    assert!(again.stderr.contains("take.mcap is there already; name a new file"), "{}", again.stderr);
 
     let replayed = command(&["replay", "take.mcap", "--export", "take"]);
     assert_eq!(replayed.code, Some(0), "{replayed:?}");

@@ -80,7 +80,7 @@ fn what_cannot_be_checked_is_refused_in_words() {
         assert_ne!(refused.code, Some(0), "{refused:?}");
         assert!(refused.stderr.contains(text), "{args:?}: {}", refused.stderr);
     };
-    refused(&["sync-check", "nowhere"], "nowhere is no configuration, recording or folder");
+    refused(&["sync-check", "nowhere"], "nowhere does not exist; name a configuration");
     refused(&["sync-check", "nowhere.mcap"], "nowhere.mcap");
     std::fs::create_dir_all(folder.path().join("one/images/00")).unwrap();
     refused(&["sync-check", "one"], "00");

@@ -2,9 +2,9 @@
 
 use std::{collections::BTreeMap, path::PathBuf};
 
-use anyhow::Result;
+use anyhow::{Result, ensure};
 use clap::Args;
-use flyrig_access::{AccessError, KeyFile, Role};
+use flyrig_access::{KeyFile, Role};
 use flyrig_fusion::{PerceptionSettings, TrackingSettings};
 use flyrig_gpu::GpuContext;
 use flyrig_report::arguments::{FpsArgs, FramesArgs, parse_seconds};
@@ -114,7 +114,7 @@ pub struct StopArgs {
 #[derive(Debug, Clone, Args)]
 pub struct HoldoutArgs {
     /// Cameras to render and score, comma separated.
-    #[arg(long, value_delimiter = ',', required = true)]
+    #[arg(long, value_delimiter = ',', value_parser = parse_camera, required = true)]
     pub holdout: Vec<String>,
 }
 
@@ -124,7 +124,7 @@ pub struct DatasetArgs {
     /// Folder in EasyMocap layout: a calibration, images/CAM, optional mask/CAM and a skinned *.glb. Or a calibrated recording, *.mcap.
     pub dataset: PathBuf,
     /// Input cameras, comma separated.
-    #[arg(long, value_delimiter = ',', required = true)]
+    #[arg(long, value_delimiter = ',', value_parser = parse_camera, required = true)]
     pub inputs: Vec<String>,
     #[command(flatten)]
     pub range: FramesArgs,
@@ -177,10 +177,15 @@ impl RigArgs {
     /// Returns the settings of a session with the rig.
     ///
     /// # Errors
-    /// Those of the key file.
-    pub fn transport(&self) -> Result<TransportConfig, AccessError> {
+    /// The key file does not exist; others of [`KeyFile::read`].
+    pub fn transport(&self) -> Result<TransportConfig> {
         let mut config = match &self.key {
             Some(path) => {
+                ensure!(
+                    path.exists(),
+                    "{} does not exist; `flyrig keys add NAME` makes a key, on the rig's computer",
+                    path.display()
+                );
                 let mut key = KeyFile::read(path, &[Role::Viewer, Role::Relay])?;
                 if let Some(address) = &self.connect {
                     let bare = ["tls/", "tcp/"].iter().find_map(|protocol| address.strip_prefix(protocol));
@@ -205,6 +210,17 @@ pub fn parse_most_ms(text: &str) -> Result<f64, String> {
     match text.parse::<f64>() {
         Ok(ms) if (4.0..=1000.0).contains(&ms) => Ok(ms),
         _ => Err(format!("'{text}' is not between 4 and 1000 milliseconds")),
+    }
+}
+
+/// Parses the name of a camera; "01, 02" is the same list as "01,02".
+///
+/// # Errors
+/// The name is empty.
+fn parse_camera(text: &str) -> Result<String, String> {
+    match text.trim() {
+        "" => Err("a camera's name is empty; names are separated by commas, as in 01,02,04".to_owned()),
+        name => Ok(name.to_owned()),
     }
 }
 

@@ -40,6 +40,18 @@ pub enum AvatarAction {
     },
 }
 
+impl AvatarAction {
+    /// Returns the command's name and the input that it opens; `None` for a command that takes no time.
+    pub fn input(&self) -> Option<(&'static str, &PathBuf)> {
+        match self {
+            Self::Build(args) => Some(("avatar build", &args.take.dataset)),
+            Self::Eval(args) => Some(("avatar eval", &args.take.dataset)),
+            Self::Render(args) => Some(("avatar render", &args.avatar)),
+            Self::Edit(_) | Self::Export(_) | Self::Info { .. } => None,
+        }
+    }
+}
+
 /// Runs the command.
 pub fn avatar(action: &AvatarAction, gpu: &dyn Fn() -> Result<GpuContext>) -> Result<()> {
     match action {

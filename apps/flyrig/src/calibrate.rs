@@ -13,6 +13,8 @@ mod rig;
 mod unjoined;
 mod views;
 
+use std::{path::PathBuf, slice::from_ref};
+
 use anyhow::Result;
 use clap::Subcommand;
 use flyrig_gpu::GpuContext;
@@ -36,6 +38,21 @@ pub enum CalibrateAction {
     Color(color::CalibrateColorArgs),
     /// Convert a calibration from or to the format of another program.
     Convert(convert::CalibrateConvertArgs),
+}
+
+impl CalibrateAction {
+    /// Returns the command's name and the inputs that it opens; `None` for a command without any.
+    pub fn input(&self) -> Option<(&'static str, &[PathBuf])> {
+        match self {
+            Self::Board(_) => None,
+            Self::Lens(args) => Some(("calibrate lens", &args.take.source.input)),
+            Self::Rig(args) => Some(("calibrate rig", &args.take.source.input)),
+            Self::Live(args) => Some(("calibrate live", &args.take.source.input)),
+            Self::Person(args) => Some(("calibrate person", &args.input.source.input)),
+            Self::Color(args) => Some(("calibrate color", &args.input.source.input)),
+            Self::Convert(args) => Some(("calibrate convert", from_ref(&args.input))),
+        }
+    }
 }
 
 /// Runs the command. `gpu` opens a graphics adapter, for simulated cameras and for tracking people.

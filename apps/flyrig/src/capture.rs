@@ -19,7 +19,10 @@ use flyrig_takes::{Needs, SourceKind, host_clock};
 use flyrig_transport::{CameraPublisher, CameraStatus, TransportConfig};
 use flyrig_types::{CameraId, Frame};
 
-use crate::{config::Config, opening::open_cameras};
+use crate::{
+    config::Config,
+    opening::{image_origin, open_cameras},
+};
 
 /// Interval at which the state of cameras is published.
 const STATUS_EVERY: Duration = Duration::from_secs(1);
@@ -34,7 +37,7 @@ pub fn capture(config: &Config, key: Option<&Path>, gpu: Option<&GpuContext>) ->
     let stop = stop::flag();
     let kind = config.source.kind;
     ensure!(kind != SourceKind::Network, "source.kind is \"network\": these cameras are on the network already");
-    let mut monitor = Monitor::start(&config.health.listen, false)?;
+    let mut monitor = Monitor::start(&config.health.listen, false)?.with_origin(image_origin(kind));
     // Cameras of this computer need no calibration here.
     let needs = if kind == SourceKind::Cameras { Needs::Frames } else { Needs::Calibration };
     let sources = open_cameras(config, needs, gpu)?.sources;

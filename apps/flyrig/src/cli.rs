@@ -1,8 +1,15 @@
 //! The command line.
 
-use std::path::PathBuf;
+use std::{
+    env,
+    path::{Path, PathBuf},
+    slice::from_ref,
+};
 
-use clap::{Parser, Subcommand};
+use clap::{
+    Parser, Subcommand,
+    error::{ContextKind, ContextValue, ErrorKind},
+};
 use flyrig_report::arguments::ProgramArgs;
 use flyrig_training::TrainArgs;
 
@@ -33,6 +40,30 @@ pub struct Cli {
     pub program: ProgramArgs,
     #[command(subcommand)]
     pub command: Command,
+}
+
+impl Cli {
+    /// Parses the command line of this process; ends it with help or an error.
+    pub fn from_arguments() -> Self {
+        Self::try_parse().unwrap_or_else(|mut error| {
+            let words: Vec<String> = env::args_os().map(|word| word.to_string_lossy().into_owned()).collect();
+            if let (ErrorKind::UnknownArgument, Some(tip)) = (error.kind(), list_tip(&words)) {
+                error.insert(ContextKind::Suggested, ContextValue::StyledStrs(vec![tip.into()]));
+            }
+            error.exit()
+        })
+    }
+}
+
+/// Returns how a list of cameras is written, if one was written with blanks.
+fn list_tip(words: &[String]) -> Option<String> {
+    let is_list = |word: &String| word == "--inputs" || word == "--holdout";
+    words.windows(3).filter(|words| is_list(&words[0])).find_map(|words| {
+        let (first, second) = (words[1].trim_end_matches(','), words[2].trim_end_matches(','));
+        let is_name = |word: &str| !word.is_empty() && !word.starts_with('-') && !word.contains(',');
+        let list = || format!("names of cameras are comma separated: {} {first},{second}", words[0]);
+        (is_name(first) && is_name(second)).then(list)
+    })
 }
 
 /// Subcommands of `flyrig`.
@@ -115,15 +146,53 @@ pub enum Command {
     },
 }
 
+impl Command {
+    /// Returns the line that a command prints at once if it takes a while to open its input; the commands themselves print what follows.
+    pub fn first_line(&self) -> Option<String> {
+        let cameras = |name: &str, config: &Path| Some(format!("{name}: opening the cameras of {}", config.display()));
+        let take = |name: &str, paths: &[PathBuf]| {
+            let paths: Vec<String> = paths.iter().map(|path| path.display().to_string()).collect();
+            Some(format!("{name}: opening {}", paths.join(", ")))
+        };
+        match self {
+            Self::Demo(_) => Some("demo: simulating a rig".to_owned()),
+            Self::Run { config, .. } => cameras("run", config),
+            Self::Record(args) => cameras("record", &args.config),
+            Self::Capture { config, .. } => cameras("capture", config),
+            Self::Replay(args) => take("replay", from_ref(&args.recording)),
+            Self::SyncCheck(args) => take("sync-check", &args.input.source.input),
+            Self::Plate(args) => take("plate", from_ref(&args.input)),
+            Self::Calibrate { action } => action.input().and_then(|(name, paths)| take(name, paths)),
+            Self::Eval(args) => take("eval", from_ref(&args.take.dataset)),
+            Self::Avatar { action } => action.input().and_then(|(name, path)| take(name, from_ref(path))),
+            Self::Sim { action: SimAction::Export(args) } => {
+                Some(format!("sim export: simulating {} frames for {}", args.frames, args.out.display()))
+            }
+            Self::Train(args) => Some(format!("train: preparing the samples of {}", args.out.display())),
+            Self::Sim { action: SimAction::Print }
+            | Self::Doctor { .. }
+            | Self::View(_)
+            | Self::Serve(_)
+            | Self::Watch(_)
+            | Self::Play(_)
+            | Self::Keys { .. }
+            | Self::Config { .. } => None,
+        }
+    }
+}
+
 /// Subcommands of `flyrig config`.
 #[derive(Debug, Subcommand)]
 pub enum ConfigAction {
     /// Print the default configuration with a comment on every key.
     Print,
-    /// Check a configuration, and the simulator's file that it names.
+    /// Check a configuration, and open the files, folders and addresses that it names.
     Check {
         /// Configuration (TOML).
         config: PathBuf,
+        /// Check the text alone, with the simulator's file: nothing else that it names is opened.
+        #[arg(long)]
+        offline: bool,
     },
 }
 
@@ -141,6 +210,18 @@ mod tests {
     #[test]
     fn numbers_with_a_minus_are_no_options() {
         assert!(Cli::try_parse_from(["flyrig", "watch", "--eye", "-1,2,3", "--target", "-1,0,1"]).is_ok());
+    }
+
+    #[test]
+    fn a_list_with_blanks_is_answered_with_commas() {
+        let tip = |line: &str| list_tip(&line.split(' ').map(str::to_owned).collect::<Vec<_>>());
+        let expected = Some("names of cameras are comma separated: --inputs 00,02".to_owned());
+        assert_eq!(tip("flyrig eval take --inputs 00 02 --holdout 01"), expected);
+        assert_eq!(tip("flyrig eval take --inputs 00, 02"), expected);
+        for other in ["flyrig eval take --inputs 00 --holdout 01", "flyrig eval --inputs 00,02 take", "flyrig eval a b"]
+        {
+            assert_eq!(tip(other), None, "{other}");
+        }
     }
 
     #[test]

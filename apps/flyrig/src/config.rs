@@ -2,7 +2,7 @@
 
 use std::path::Path;
 
-use anyhow::{Context, Result, anyhow, ensure};
+use anyhow::{Context, Result, anyhow, bail, ensure};
 use flyrig_capture::Rotation;
 use flyrig_fusion::{
     AppearanceOptions, BodySettings, BudgetSettings, Origin, OutputSettings, PerceptionSettings, SessionSettings,
@@ -19,6 +19,9 @@ use crate::{simulator_file, toml_errors::explain};
 
 /// Commented default file, as `flyrig config print` writes it; a test keeps it equal to `Config::default()`.
 pub const DEFAULT_TOML: &str = include_str!("../assets/default.toml");
+
+/// Names of `appearance.weights` that are no files.
+const BUNDLED: [&str; 2] = ["small", "tiny"];
 
 /// Tables and keys of earlier versions, and what to do about each.
 const REMOVED: [(&str, &str); 9] = [
@@ -145,9 +148,13 @@ impl Config {
     /// # Errors
     /// Those of [`Self::load`].
     pub fn load_for_capture(path: &Path) -> Result<Self> {
+        check_is_configuration(path)?;
         let text = flyrig_types::read_text(path)
             .with_context(|| format!("cannot read the configuration {}", path.display()))?;
         let mut config = Self::parse_values(&text).with_context(|| in_file(path))?;
+        if let Some(folder) = path.parent() {
+            config.resolve_paths(folder);
+        }
         if config.source.kind != SourceKind::Cameras {
             config.check_scene().with_context(|| in_file(path))?;
         }
@@ -179,6 +186,33 @@ impl Config {
         })?;
         config.check_values()?;
         Ok(config)
+    }
+
+    /// Makes relative paths relative to the folder of the configuration.
+    fn resolve_paths(&mut self, folder: &Path) {
+        let (source, perception, body) = (&mut self.source, &mut self.perception, &mut self.body);
+        let paths = [
+            &mut source.path,
+            &mut source.calibration,
+            &mut perception.network,
+            &mut perception.plates,
+            &mut body.template,
+            &mut body.person,
+            &mut body.avatar,
+            &mut self.transport.keys,
+            &mut self.web.certificate,
+            &mut self.web.key,
+        ];
+        for path in paths.into_iter().filter(|path| !path.as_os_str().is_empty()) {
+            *path = folder.join(&path);
+        }
+        // A name of networks that come with flyrig is no path.
+        if let Some(weights) =
+            self.appearance.weights.as_mut().filter(|path| !BUNDLED.iter().any(|name| path.as_os_str() == *name))
+        {
+            *weights = folder.join(&weights);
+        }
+        simulator_file::resolve_paths(&mut self.sim, folder);
     }
 
     /// Returns the simulator's file; `None` for its defaults and for other sources.
@@ -274,6 +308,22 @@ impl Config {
         );
         Ok(())
     }
+}
+
+/// Checks that a path is not a folder or a recording, which `[source]` names.
+fn check_is_configuration(path: &Path) -> Result<()> {
+    let is_recording = path.extension().is_some_and(|ending| ending.eq_ignore_ascii_case("mcap"));
+    let (what, kind) = match (path.is_dir(), is_recording) {
+        (true, _) => ("a folder", "folder"),
+        (false, true) => ("a recording", "mcap"),
+        (false, false) => return Ok(()),
+    };
+    bail!(
+        "{} is {what}, not a configuration (*.toml): write one with [source] kind = \"{kind}\" and path = \"{}\" (`flyrig \
+         config print` shows every key)",
+        path.display(),
+        path.display()
+    )
 }
 
 fn in_file(path: &Path) -> String {
@@ -382,6 +432,26 @@ mod tests {
     fn a_key_of_another_table_with_the_name_of_a_removed_one_is_only_unknown() {
         let error = Config::parse("[sync]\nrest = 1\n").unwrap_err().to_string();
         assert!(error.contains("unknown field `rest`") && !error.contains("no longer"), "{error}");
+    }
+
+    #[test]
+    fn paths_are_relative_to_the_file_and_names_are_none() {
+        let folder = tempfile::tempdir().unwrap();
+        let rig = folder.path().join("rig.toml");
+        let text = "[body]\navatar = \"anna.flyavatar\"\n[transport]\nkeys = \"keys\"\n[web]\nkey = \"/etc/key.pem\"\n\
+                    [appearance]\nweights = \"tiny\"\n[sim.motion]\nbvh = \"walk.bvh\"\n";
+        std::fs::write(&rig, text).unwrap();
+        let config = Config::load(&rig).unwrap();
+        let at = |name: &str| folder.path().join(name);
+        assert_eq!((&config.body.avatar, &config.transport.keys), (&at("anna.flyavatar"), &at("keys")));
+        assert_eq!(
+            (config.sim.motion.bvh, config.web.key.as_path()),
+            (Some(at("walk.bvh")), Path::new("/etc/key.pem"))
+        );
+        assert_eq!(config.appearance.weights.as_deref(), Some(Path::new("tiny")));
+        assert!(config.source.path.as_os_str().is_empty() && config.perception.plates.as_os_str().is_empty());
+        std::fs::write(&rig, text.replace("tiny", "mine.safetensors")).unwrap();
+        assert_eq!(Config::load(&rig).unwrap().appearance.weights, Some(at("mine.safetensors")));
     }
 
     #[test]

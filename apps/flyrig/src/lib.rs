@@ -8,6 +8,7 @@ mod calibrate;
 mod capture;
 mod cli;
 mod config;
+mod config_check;
 mod demo;
 mod doctor;
 mod eval;
@@ -63,14 +64,34 @@ pub fn check_simulator(text: &str) -> Result<(), String> {
     simulator_file::parse(text).map(|_| ()).map_err(|error| program::one_line(&error))
 }
 
+/// Checks a command line, whose first word is the program: its options and values must be known, and nothing is run.
+///
+/// # Errors
+/// The error that the command would print.
+pub fn check_command(words: &[String]) -> Result<(), String> {
+    use clap::error::ErrorKind;
+    match Cli::try_parse_from(words) {
+        Err(error) if !matches!(error.kind(), ErrorKind::DisplayHelp | ErrorKind::DisplayVersion) => {
+            Err(error.to_string())
+        }
+        Ok(_) | Err(_) => Ok(()),
+    }
+}
+
 /// Runs the command line of this process. Call it at the beginning of `main`, before any other thread starts.
 #[must_use]
 #[allow(unsafe_code)]
 pub fn main() -> ExitCode {
     // SAFETY: no other thread runs yet.
-    unsafe { flyrig_transport::use_one_network_thread() };
-    let cli = Cli::parse();
+    unsafe {
+        flyrig_transport::use_one_network_thread();
+        program::look_for_no_desktop();
+    }
+    let cli = Cli::from_arguments();
     program::start_log(cli.program.verbose, cli.log_json);
+    if let Some(line) = cli.command.first_line() {
+        eprintln!("{line}");
+    }
     program::exit_code(traced(cli.program.trace.as_deref(), || dispatch(&cli)))
 }
 
@@ -123,15 +144,6 @@ fn dispatch(cli: &Cli) -> Result<()> {
             print!("{DEFAULT_TOML}");
             Ok(())
         }
-        Command::Config { action: ConfigAction::Check { config } } => {
-            let loaded = Config::load_for_capture(config)?;
-            match loaded.check_scene() {
-                Ok(()) => println!("{} is right", config.display()),
-                Err(error) => {
-                    println!("{} is right for `flyrig capture` and `flyrig doctor` alone: {error}", config.display());
-                }
-            }
-            Ok(())
-        }
+        Command::Config { action: ConfigAction::Check { config, offline } } => config_check::check(config, *offline),
     }
 }

@@ -28,7 +28,7 @@ use foxglove::messages::Log;
 use crate::{
     arguments::StopArgs,
     config::{Config, RecordSection},
-    opening::open_cameras,
+    opening::{image_origin, open_cameras},
     pose_recording::PoseRecording,
 };
 
@@ -59,6 +59,10 @@ pub fn recorder(
     settings: &RecordSection,
     pacing: Pacing,
 ) -> Result<Recorder> {
+    ensure!(!path.exists(), "{} is there already; name a new file", path.display());
+    if let Some(folder) = path.parent().filter(|folder| !folder.as_os_str().is_empty()) {
+        ensure!(folder.is_dir(), "{}: its folder {} does not exist; create it first", path.display(), folder.display());
+    }
     let keep_all = pacing == Pacing::Lossless;
     let quality = settings.jpeg_quality;
     let compression = (quality > 0).then_some(Compression { quality, keep_all });
@@ -124,7 +128,9 @@ impl RigRecording {
 /// Runs `flyrig record`.
 pub fn record(config: &Config, args: &RecordArgs, gpu: Option<&GpuContext>) -> Result<()> {
     let stop = stop::flag();
-    let mut monitor = Monitor::start(&config.health.listen, false)?.with_keys(&config.transport.keys);
+    let mut monitor = Monitor::start(&config.health.listen, false)?
+        .with_keys(&config.transport.keys)
+        .with_origin(image_origin(config.source.kind));
     let take = open_recorded(config, gpu)?;
     let (pacing, rig) = (take.pacing(), take.calibration.map(|calibration| calibration.rig));
     let ids: Vec<CameraId> = take.sources.iter().map(|camera| camera.camera().clone()).collect();

@@ -19,7 +19,7 @@ use flyrig_takes::{
 };
 use flyrig_types::{CameraId, Frame, FrameSet, Intrinsics, PixelFormat, Rig};
 
-use crate::{arguments::LagArgs, pose_recording};
+use crate::{arguments::LagArgs, opening::require_recording, pose_recording};
 
 /// Arguments of `flyrig replay`.
 #[derive(Debug, Args)]
@@ -36,6 +36,14 @@ pub struct ReplayArgs {
 /// Runs the command.
 pub fn replay(args: &ReplayArgs) -> Result<()> {
     stop::flag();
+    let folder = args.recording.display();
+    require_recording(
+        &args.recording,
+        "flyrig replay reads a recording (*.mcap)",
+        &format!(
+            "Score a folder with `flyrig eval {folder}`, or run the rig on it: source.kind = \"folder\" and `flyrig run`"
+        ),
+    )?;
     let recorded = recorded_cameras(&args.recording)?;
     recorded.log_notes(&args.recording);
     let RecordedCameras { ids, rig, lenses, .. } = recorded;

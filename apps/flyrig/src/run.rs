@@ -19,7 +19,8 @@ use flyrig_web::WebServer;
 use self::{known::PriorKnowledge, live::LiveRun};
 use crate::{
     config::{Config, WatchMode},
-    opening::open_cameras,
+    config_check::check_endpoint,
+    opening::{image_origin, open_cameras},
     recording::{self, RigRecording},
     serve::print_fingerprint,
 };
@@ -27,7 +28,11 @@ use crate::{
 /// Runs the command. `recording` names a file that the cameras are recorded to; `show_table` prints the cameras' health as a table.
 pub fn run(config: &Config, gpu: &GpuContext, recording: Option<&Path>, show_table: bool) -> Result<()> {
     stop::flag();
-    let mut monitor = Monitor::start(&config.health.listen, show_table)?.with_keys(&config.transport.keys);
+    // Cameras and kernels take their time; a taken address is reported before.
+    config.transport.listen.iter().try_for_each(|endpoint| check_endpoint("transport.listen", endpoint))?;
+    let mut monitor = Monitor::start(&config.health.listen, show_table)?
+        .with_keys(&config.transport.keys)
+        .with_origin(image_origin(config.source.kind));
     let mut take = open_cameras(config, Needs::Calibration, Some(gpu))?;
     let calibration = take.calibration.take().context("the cameras have no calibration")?;
     dataset::require_masks(&config.perception, &calibration.plates)?;

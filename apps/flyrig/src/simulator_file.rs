@@ -18,7 +18,18 @@ pub fn load(path: &Path) -> Result<SimConfig> {
     let in_file = || format!("in the simulator's configuration {}", path.display());
     let text = flyrig_types::read_text(path)
         .with_context(|| format!("cannot read the simulator's configuration {}", path.display()))?;
-    parse(&text).with_context(in_file)
+    let mut config = parse(&text).with_context(in_file)?;
+    if let Some(folder) = path.parent() {
+        resolve_paths(&mut config, folder);
+    }
+    Ok(config)
+}
+
+/// Makes relative paths relative to the folder of the file that holds them.
+pub fn resolve_paths(config: &mut SimConfig, folder: &Path) {
+    for path in [&mut config.motion.bvh, &mut config.motion.gltf].into_iter().flatten() {
+        *path = folder.join(&path);
+    }
 }
 
 /// Reads and checks a text.

@@ -18,7 +18,9 @@ use flyrig_stream::{Stamp, restamp, stamp_of, template_hash};
 use flyrig_takes::recorded::recorded_cameras;
 use flyrig_transport::{Interests, PersonMessage, Publisher, Subscriber, TransportConfig};
 
-use crate::{config::RecordSection, recording, watch::WatchArgs};
+use crate::{
+    config::RecordSection, config_check::check_endpoint, opening::require_recording, recording, watch::WatchArgs,
+};
 
 /// Arguments of `flyrig play`.
 #[derive(Debug, Args)]
@@ -153,6 +155,12 @@ pub fn record(args: &WatchArgs, path: &Path) -> Result<()> {
     if let Some(problem) = recorded.problem {
         anyhow::bail!("the recording broke off after {motions} frames: {problem}");
     }
+    ensure!(
+        motions > 0,
+        "nobody was received in {:.0} s, so {} holds no frame of people: wait until the rig has tracked a person",
+        started.elapsed().as_secs_f64(),
+        path.display()
+    );
     eprintln!("watch: recorded {motions} frames of people, {:.1} MB in {}", bytes as f64 / 1e6, path.display());
     Ok(())
 }
@@ -160,6 +168,11 @@ pub fn record(args: &WatchArgs, path: &Path) -> Result<()> {
 /// Runs `flyrig play`.
 pub fn play(args: &PlayArgs) -> Result<()> {
     let stop = stop::flag();
+    require_recording(
+        &args.recording,
+        "flyrig play reads a recording of `flyrig watch --record`",
+        "Run the rig on a folder: source.kind = \"folder\" and `flyrig run`",
+    )?;
     let rig = recorded_cameras(&args.recording)?.rig.with_context(|| {
         format!("{} has no calibration; record it with flyrig watch --record", args.recording.display())
     })?;
@@ -169,6 +182,7 @@ pub fn play(args: &PlayArgs) -> Result<()> {
         "{} has no person stream; record one with flyrig watch --record",
         args.recording.display()
     );
+    check_endpoint("--listen", &args.listen)?;
     let config = TransportConfig {
         listen: vec![args.listen.clone()],
         keys: args.keys.clone().unwrap_or_default(),

@@ -7,7 +7,7 @@ use std::{
     time::{Duration, Instant},
 };
 
-use anyhow::{Context, Result, ensure};
+use anyhow::{Context, Result, bail, ensure};
 use clap::Args;
 use flyrig_report::{arguments::parse_size, png, stop, write_whole};
 use flyrig_transport::{
@@ -123,6 +123,7 @@ pub fn watch(args: &WatchArgs) -> Result<()> {
     let subscriber = Subscriber::open(&config, &Interests { views, ..Interests::default() })?;
     let mut complaints = Complaints::default();
     eprintln!("watch: rig '{}' at {}, waiting for images (Ctrl-C ends)", config.rig, config.connect.join(", "));
+    let opened = Instant::now();
     if let Some(eye) = args.eye {
         // The rig says which way is up.
         let rig = loop {
@@ -131,8 +132,9 @@ pub fn watch(args: &WatchArgs) -> Result<()> {
                 Ok(None) => {}
                 Err(error) => complaints.add_error(&error),
             }
-            if stop::requested() {
-                return Ok(());
+            let over = args.stop.seconds.is_some_and(|limit| opened.elapsed().as_secs_f64() >= limit);
+            if stop::requested() || over {
+                bail!("no image was received: {}", absence(&subscriber, &config, args, ""));
             }
         };
         subscriber.request_viewpoint(&viewpoint(eye, args, rig.world_up)?, args.max_fps)?;
@@ -183,8 +185,26 @@ pub fn watch(args: &WatchArgs) -> Result<()> {
     if let Some(path) = &args.stats {
         write_whole(path, &serde_json::to_vec_pretty(&stats)?)?;
     }
+    let absence = absence(&subscriber, &config, args, &refused);
     subscriber.close()?;
+    ensure!(received > 0, "no image was received: {absence}");
     Ok(())
+}
+
+/// Explains why no image has come.
+fn absence(subscriber: &Subscriber, config: &TransportConfig, args: &WatchArgs, refused: &str) -> String {
+    if !refused.is_empty() {
+        return format!("the rig refuses the viewpoint: {refused}");
+    }
+    match (subscriber.publishers(), subscriber.trouble(), args.eye) {
+        (0, Some(trouble), _) => trouble,
+        (0, None, _) => format!("no rig '{}' at {}; check --rig and --connect", config.rig, config.connect.join(", ")),
+        (_, _, Some(_)) => format!("rig '{}' is up, but drew nothing from --eye; has it seen a person?", config.rig),
+        (_, _, None) => format!(
+            "rig '{}' is up, but published no image of view '{}'; check --view, and whether it has seen a person",
+            config.rig, args.view
+        ),
+    }
 }
 
 fn viewpoint(eye: [f64; 3], args: &WatchArgs, world_up: DVec3) -> Result<Camera> {

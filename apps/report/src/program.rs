@@ -1,6 +1,6 @@
 //! Start and end of every program: logging, graphics adapter, exit code.
 
-use std::{io::IsTerminal as _, process::ExitCode};
+use std::{env, io::IsTerminal as _, process::ExitCode};
 
 use anyhow::Result;
 use flyrig_gpu::{AdapterChoice, GpuContext};
@@ -19,12 +19,31 @@ pub fn open_gpu(adapter: Option<&str>) -> Result<GpuContext> {
     Ok(GpuContext::new(&choice)?)
 }
 
+/// Name of the variable that keeps Mesa from asking the desktop which adapter it uses.
+const NO_DESKTOP_ADAPTER: &str = "NODEVICE_SELECT";
+
+/// Keeps Mesa's driver from looking for a desktop where there is none: it would print `XDG_RUNTIME_DIR is invalid or not set`.
+/// Call it at the beginning of `main`.
+///
+/// # Safety
+/// No other thread may run yet: it could read the environment while it changes.
+#[allow(unsafe_code)]
+pub unsafe fn look_for_no_desktop() {
+    let has_desktop = env::var("XDG_RUNTIME_DIR").is_ok_and(|folder| folder.starts_with('/'));
+    if !has_desktop && env::var_os(NO_DESKTOP_ADAPTER).is_none() {
+        // SAFETY: the caller guarantees that this is the only thread.
+        unsafe { env::set_var(NO_DESKTOP_ADAPTER, "1") };
+    }
+}
+
 /// Starts logging to standard error, in more detail with each level of `verbose`, and with one JSON object per line if `json`.
 pub fn start_log(verbose: u8, json: bool) {
     let level = match verbose {
-        // An image without a board is no reason for a warning.
+        // An image without a board is no reason for a warning, and what the libraries below report as a problem of theirs is reported
+        // again as an error of ours.
         0 => {
-            "warn,flyrig=info,flyrig_fusion=info,zenoh=error,calib_targets_chessboard=error,calib_targets_charuco=error"
+            "warn,flyrig=info,flyrig_fusion=info,zenoh=error,calib_targets_chessboard=error,calib_targets_charuco=error,\
+             wgpu=off,naga=off,winit=off"
         }
         1 => {
             "info,flyrig=debug,flyrig_fusion=debug,flyrig_capture=debug,flyrig_sync=debug,flyrig_calib=debug,\

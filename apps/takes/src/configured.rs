@@ -10,7 +10,7 @@ use flyrig_body::{ShapeParams, default_template, load_gltf};
 use flyrig_capture::{CameraSource as _, FolderOptions, SourceOpener};
 use flyrig_fusion::{Origin, PerceptionSettings};
 use flyrig_gpu::GpuContext;
-use flyrig_sim::{SimConfig, SimTime, Simulator};
+use flyrig_sim::{SimConfig, SimTime, Simulator, camera_ring};
 use flyrig_sync::SyncSettings;
 use flyrig_transport::TransportConfig;
 use flyrig_types::{Camera, CameraId, Image, Rig, ThreadWatch};
@@ -61,13 +61,31 @@ impl TakeConfig {
         let mut take = if kind == SourceKind::Sim { self.open_simulated(&gpu()?)? } else { self.open_calibrated()? };
         if let (Needs::Calibration, Some(calibration)) = (needs, &mut take.calibration) {
             self.load_plates(calibration)?;
-            let lagging: Vec<String> = self.sync.lags_nanos.keys().map(CameraId::to_string).collect();
-            dataset::select_cameras(&calibration.rig, &lagging, "the rig, but in sync.lags_ms")?;
+            self.check_lags(&calibration.rig)?;
         }
         take.is_live = kind.is_live();
         take.given_masks = self.perception.masks == Origin::Given;
         take.sync = self.sync.clone();
         Ok(take)
+    }
+
+    /// Opens the files that the configuration names, without starting cameras, connecting to other computers or drawing: calibration, images,
+    /// plates and body, with the names of the cameras.
+    ///
+    /// # Errors
+    /// Names a file, camera or setting that is missing or wrong.
+    pub fn check(&self) -> Result<()> {
+        let rig = if self.source.kind == SourceKind::Sim {
+            dataset::select_cameras(&camera_ring(&self.sim)?, &self.source.names(), "the simulated rig")
+                .context("source.cameras ([] takes all)")?
+        } else {
+            let rig = self.load_rig()?;
+            self.open_stored(&rig)?;
+            self.load_body()?;
+            rig
+        };
+        self.load_plates(&mut Calibration::without_plates(rig.clone()))?;
+        self.check_lags(&rig)
     }
 
     /// Opens the simulated cameras with the plates of their room.
@@ -78,7 +96,8 @@ impl TakeConfig {
         // An estimator starts without knowledge of the person.
         let knows_shape = self.perception.shape() == Origin::Given;
         let template = if knows_shape { template } else { default_template(&ShapeParams::default())? };
-        let rig = dataset::select_cameras(&rig, &self.source.names(), "the simulated rig")?;
+        let rig = dataset::select_cameras(&rig, &self.source.names(), "the simulated rig")
+            .context("source.cameras ([] takes all)")?;
         let plates = simulated_plates(&simulator, &rig)?;
         let simulator = Arc::new(Mutex::new(simulator));
         let time = if self.source.real_time { SimTime::Real } else { SimTime::Exact };
@@ -98,12 +117,7 @@ impl TakeConfig {
     fn open_calibrated(&self) -> Result<Take> {
         let rig = self.load_rig()?;
         let (sources, threads) = self.open_sources(&rig)?;
-        let body = if self.template.as_os_str().is_empty() {
-            TakeBody { template: default_template(&ShapeParams::default())?, track: None }
-        } else {
-            let human = load_gltf(&self.template)?;
-            TakeBody { template: human.template, track: human.track }
-        };
+        let body = self.load_body()?;
         Ok(Take {
             calibration: Some(Calibration::without_plates(rig)),
             body: Some(body),
@@ -112,13 +126,32 @@ impl TakeConfig {
         })
     }
 
+    fn load_body(&self) -> Result<TakeBody> {
+        if self.template.as_os_str().is_empty() {
+            return Ok(TakeBody { template: default_template(&ShapeParams::default())?, track: None });
+        }
+        let human = load_gltf(&self.template).context("body.template")?;
+        Ok(TakeBody { template: human.template, track: human.track })
+    }
+
+    /// Checks that cameras with a time offset are cameras of the rig.
+    fn check_lags(&self, rig: &Rig) -> Result<()> {
+        let lagging: Vec<String> = self.sync.lags_nanos.keys().map(CameraId::to_string).collect();
+        dataset::select_cameras(rig, &lagging, "the rig, but in sync.lags_ms")?;
+        Ok(())
+    }
+
     fn load_rig(&self) -> Result<Rig> {
         let source = &self.source;
         let rig = if source.kind.is_live() {
             devices::load_rig(source)?
         } else {
             let chosen: Vec<CameraId> = source.names().into_iter().map(CameraId::from).collect();
-            match (source.calibration_folder(), source.footage(&chosen)) {
+            let footage = source.footage(&chosen);
+            if let Some(footage) = &footage {
+                footage.check_dataset().context("source.path")?;
+            }
+            match (source.calibration_folder(), footage) {
                 (None, Some(footage)) => footage.load_rig(&chosen)?,
                 (folder, footage) => {
                     let folder = folder.unwrap_or(&source.path);
@@ -127,17 +160,13 @@ impl TakeConfig {
                 }
             }
         };
-        dataset::select_cameras(&rig, &source.names(), "the calibration")
+        dataset::select_cameras(&rig, &source.names(), "the calibration").context("source.cameras ([] takes all)")
     }
 
     /// Opens one source per camera of the rig, and returns the threads that they need.
     fn open_sources(&self, rig: &Rig) -> Result<(Vec<SourceOpener>, Vec<ThreadWatch>)> {
-        let ids: Vec<CameraId> = rig.cameras.iter().map(|camera| camera.id.clone()).collect();
-        if let Some(footage) = self.source.footage(&ids) {
-            let with_masks = self.perception.masks == Origin::Given;
-            let options = FolderOptions { fps: self.source.fps, with_masks, frames: None };
-            let sources = footage.open(Some(&ids), &options)?.sources;
-            return Ok((ready(sources), Vec::new()));
+        if let Some(sources) = self.open_stored(rig)? {
+            return Ok((sources, Vec::new()));
         }
         if self.source.kind == SourceKind::Network {
             let (openers, clocks) = network::openers(&self.transport, rig)?;
@@ -146,13 +175,25 @@ impl TakeConfig {
         Ok((devices::openers(&self.source)?, Vec::new()))
     }
 
+    /// Opens stored cameras; `None` for live ones.
+    fn open_stored(&self, rig: &Rig) -> Result<Option<Vec<SourceOpener>>> {
+        let ids: Vec<CameraId> = rig.cameras.iter().map(|camera| camera.id.clone()).collect();
+        let Some(footage) = self.source.footage(&ids) else { return Ok(None) };
+        let with_masks = self.perception.masks == Origin::Given;
+        if let (true, Some(root)) = (with_masks, footage.folder()) {
+            dataset::require_given_masks(root, rig, "set perception.masks = \"estimated\"")?;
+        }
+        let options = FolderOptions { fps: self.source.fps, with_masks, frames: None };
+        Ok(Some(ready(footage.open(Some(&ids), &options)?.sources)))
+    }
+
     /// Loads the plates of stored and live cameras, unless a key colour replaces them.
     fn load_plates(&self, calibration: &mut Calibration) -> Result<()> {
         let folder = self.source.calibration_folder();
         let has_folder = folder.is_some() || !self.perception.plates.as_os_str().is_empty();
         if self.source.kind != SourceKind::Sim && has_folder && self.perception.key_color.is_empty() {
-            let folder = dataset::plate_folder(folder.unwrap_or(&self.source.path), &self.perception);
-            calibration.plates = dataset::load_plates(&folder, &calibration.rig)?;
+            let folder = folder.unwrap_or(&self.source.path);
+            calibration.plates = dataset::load_plates_of(folder, &self.perception, &calibration.rig)?;
         }
         Ok(())
     }

@@ -2,7 +2,7 @@
 
 use std::path::{Path, PathBuf};
 
-use anyhow::{Context, Result, bail};
+use anyhow::{Context, Result, bail, ensure};
 use flyrig_calib::{CalibError, load_calibration};
 use flyrig_capture::{VideoOptions, VideoReplay, folder_image_size, read_image};
 use flyrig_fusion::{Origin, PerceptionSettings};
@@ -63,6 +63,43 @@ pub fn has_calibration(folder: &Path) -> bool {
     CALIBRATION_FILES.iter().any(|file| folder.join(file).exists())
 }
 
+/// Checks that a path is a folder that exists; `what` describes its content, such as "a folder with images/CAM".
+///
+/// # Errors
+/// The path does not exist, or is a file.
+pub(crate) fn require_folder(path: &Path, what: &str) -> Result<()> {
+    ensure!(path.exists(), "{} does not exist; name {what}", path.display());
+    ensure!(path.is_dir(), "{} is a file; name {what}", path.display());
+    Ok(())
+}
+
+/// Checks that a folder exists and holds a calibration, complete or not.
+///
+/// # Errors
+/// Says that the folder is missing, or how it gets a calibration.
+pub(crate) fn require_calibration(folder: &Path) -> Result<()> {
+    require_folder(folder, "the folder of a calibration")?;
+    ensure!(
+        has_calibration(folder),
+        "{} holds no calibration (calibration.toml, or intri.yml and extri.yml): make one with `flyrig calibrate`, or convert \
+         another program's with `flyrig calibrate convert`",
+        folder.display()
+    );
+    Ok(())
+}
+
+/// Checks that a data set has a folder of masks for every camera; `fix` is the setting with which none are needed.
+///
+/// # Errors
+/// Names the first camera without one, and the fix.
+pub(crate) fn require_given_masks(root: &Path, rig: &Rig, fix: &str) -> Result<()> {
+    for camera in &rig.cameras {
+        let masks = root.join("mask").join(camera.id.as_str());
+        ensure!(masks.is_dir(), "camera {} has no masks ({} does not exist); {fix}", camera.id, masks.display());
+    }
+    Ok(())
+}
+
 /// Loads the calibrated cameras of a data set.
 ///
 /// A calibration without image sizes needs the images or the video of every camera.
@@ -79,6 +116,7 @@ pub fn load_rig(root: &Path, chosen: &[CameraId]) -> Result<Rig> {
 /// # Errors
 /// See [`load_rig`].
 pub(crate) fn load_rig_of(calibration: &Path, images: &Path, chosen: &[CameraId]) -> Result<Rig> {
+    require_calibration(calibration)?;
     let size = |id: &CameraId| image_size(images, id).or_else(|| image_size(calibration, id));
     load_calibration(calibration, &size).or_else(|error| {
         if matches!(error, CalibError::UnknownSize { .. }) {
@@ -114,6 +152,17 @@ pub fn plate_folder(root: &Path, settings: &PerceptionSettings) -> PathBuf {
 #[must_use]
 pub fn plate_file(folder: &Path, id: &CameraId) -> PathBuf {
     folder.join(format!("{id}.png"))
+}
+
+/// Loads the plates that the settings name, or those of the data set; an absent folder of the data set has none.
+///
+/// # Errors
+/// Those of [`load_plates`]; the folder that the settings name does not exist.
+pub(crate) fn load_plates_of(root: &Path, settings: &PerceptionSettings, rig: &Rig) -> Result<Vec<Option<Image>>> {
+    if !settings.plates.as_os_str().is_empty() {
+        require_folder(&settings.plates, "a folder of plates CAM.png (`flyrig plate`), or none").context("plates")?;
+    }
+    load_plates(&plate_folder(root, settings), rig)
 }
 
 /// Loads the plates of a folder: RGB images of the empty scene, one per slot of the rig, `None` for a camera without one.

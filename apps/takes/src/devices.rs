@@ -5,7 +5,10 @@ use flyrig_calib::load_calibration;
 use flyrig_capture::SourceOpener;
 use flyrig_types::{CameraId, Rig};
 
-use crate::source_section::{CameraEntry, SourceSection};
+use crate::{
+    dataset,
+    source_section::{CameraEntry, SourceSection},
+};
 
 /// Loads the calibration of live cameras. Image sizes that its files lack come from the configuration; sizes in both must agree.
 pub(crate) fn load_rig(source: &SourceSection) -> Result<Rig> {
@@ -13,7 +16,9 @@ pub(crate) fn load_rig(source: &SourceSection) -> Result<Rig> {
         let entry = source.cameras.iter().find(|entry| entry.name() == id.as_str())?;
         entry.device().ok().map(|section| (section.size[0], section.size[1]))
     };
-    Ok(load_calibration(source.calibration_folder().unwrap_or(&source.path), &size)?)
+    let folder = source.calibration_folder().unwrap_or(&source.path);
+    dataset::require_calibration(folder)?;
+    Ok(load_calibration(folder, &size)?)
 }
 
 /// Returns an opener for every camera of the configuration; images keep the cameras' own formats.

@@ -10,6 +10,20 @@ use crate::{dataset, recorded::recorded_cameras};
 
 /// Endings of video files, in any case.
 pub(crate) const VIDEO_ENDINGS: [&str; 7] = ["mp4", "mov", "m4v", "mkv", "avi", "webm", "mts"];
+/// Inputs that a command line may name.
+pub(crate) const INPUTS: &str =
+    "a configuration (*.toml), a recording (*.mcap), a folder with images/CAM, or the videos of all cameras";
+
+/// Checks that every input of a command line exists.
+///
+/// # Errors
+/// Names the first that does not, and what may stand there.
+pub fn require_inputs(paths: &[PathBuf]) -> Result<()> {
+    for path in paths {
+        ensure!(path.exists(), "{} does not exist; name {INPUTS}", path.display());
+    }
+    Ok(())
+}
 
 /// Stored images of several cameras.
 ///
@@ -59,20 +73,36 @@ impl Footage {
     /// Finds the footage that a command line names: one folder, one recording, or videos.
     ///
     /// # Errors
-    /// The only path does not exist.
+    /// Names a path that does not exist, or a folder among videos.
     pub fn from_paths(paths: &[PathBuf]) -> Result<Self> {
+        require_inputs(paths)?;
         match paths {
             [path] if has_ending(path, "mcap") || path.is_dir() => Ok(Self::from_dataset(path)),
             videos => {
-                if let [path] = videos {
-                    ensure!(
-                        path.exists(),
-                        "{} is no configuration, recording or folder; it does not exist",
-                        path.display()
-                    );
+                for path in videos {
+                    ensure!(!path.is_dir(), "{} is a folder among files; name {INPUTS}", path.display());
                 }
                 Ok(Self::Videos(videos.to_vec()))
             }
+        }
+    }
+
+    /// Checks that the folder or recording of a data set exists.
+    ///
+    /// # Errors
+    /// Names the path, and what is expected in its place.
+    pub(crate) fn check_dataset(&self) -> Result<()> {
+        match self {
+            Self::Folder(root) => dataset::require_folder(
+                root,
+                "a folder with a calibration and images/CAM, or a recording (*.mcap); `flyrig record` makes one of \
+                 videos (source.kind = \"video\")",
+            ),
+            Self::Recording(path) => {
+                ensure!(path.exists(), "{} does not exist; name a recording of `flyrig record`", path.display());
+                Ok(())
+            }
+            Self::Videos(_) => Ok(()),
         }
     }
 
@@ -197,7 +227,9 @@ mod tests {
         let folder = tempfile::tempdir().unwrap();
         let at = |name: &str| folder.path().join(name);
         std::fs::create_dir(at("dir.mcap")).unwrap();
-        std::fs::write(at("a.mp4"), b"").unwrap();
+        for file in ["a.mp4", "b.mp4", "take.MCAP"] {
+            std::fs::write(at(file), b"").unwrap();
+        }
         let find = |names: &[&str]| Footage::from_paths(&names.iter().map(|name| at(name)).collect::<Vec<_>>());
         assert_eq!(find(&["dir.mcap"]).unwrap(), Footage::Folder(at("dir.mcap")));
         assert_eq!(find(&["take.MCAP"]).unwrap(), Footage::Recording(at("take.MCAP")));
@@ -205,7 +237,9 @@ mod tests {
         assert_eq!(find(&["videos"]).unwrap(), Footage::VideoFolder(at("videos")));
         assert_eq!(find(&["a.mp4"]).unwrap(), Footage::Videos(vec![at("a.mp4")]));
         assert_eq!(find(&["a.mp4", "b.mp4"]).unwrap(), Footage::Videos(vec![at("a.mp4"), at("b.mp4")]));
-        let error = find(&["nowhere"]).unwrap_err().to_string();
-        assert!(error.contains("nowhere is no configuration, recording or folder; it does not exist"), "{error}");
+        let error = |names: &[&str]| find(names).unwrap_err().to_string();
+        assert!(error(&["nowhere"]).contains("nowhere does not exist; name a configuration (*.toml)"));
+        assert!(error(&["a.mp4", "c.mp4"]).contains("c.mp4 does not exist; name"));
+        assert!(error(&["a.mp4", "dir.mcap"]).contains("dir.mcap is a folder among files; name"));
     }
 }

@@ -31,7 +31,7 @@ pub use avatar_take::AvatarTake;
 pub use check::{CheckInput, Checked, check, check_take, mark_checked};
 pub use color_samples::ColorSampler;
 pub use configured::{TakeConfig, simulated_plates};
-pub use footage::{Footage, OpenFootage};
+pub use footage::{Footage, OpenFootage, require_inputs};
 pub use import::{ImportOptions, import, parse_pair};
 pub use known_avatar::{KnownBody, known_body};
 pub use network::host_clock;

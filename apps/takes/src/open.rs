@@ -8,7 +8,7 @@ use flyrig_gpu::GpuContext;
 
 use crate::{
     configured::TakeConfig,
-    footage::{Footage, has_ending},
+    footage::{Footage, INPUTS, has_ending},
     recorded::recorded_cameras,
     take::{Calibration, Needs, Take, ready},
 };
@@ -94,7 +94,7 @@ impl Take {
                 Ok(Self { calibration: cameras.rig.map(Calibration::without_plates), ..take })
             }
             Footage::Videos(files) if needs_calibration && files.len() < 2 => bail!(
-                "{} is no configuration, recording or folder; name several videos, or one of these",
+                "{} is one file, and neither a configuration nor a recording; name {INPUTS}",
                 files.first().map_or_else(String::new, |file| file.display().to_string())
             ),
             Footage::Folder(_) | Footage::VideoFolder(_) | Footage::Videos(_) => {

@@ -102,6 +102,7 @@ impl Replay {
     pub fn open(settings: &ReplaySettings, gpu: &GpuContext) -> Result<Self> {
         settings.session.validate()?;
         let footage = Footage::from_dataset(&settings.dataset);
+        footage.check_dataset()?;
         let (rig, holdout) = load_rigs(settings, &footage)?;
         let sync = SyncSettings { lags_nanos: settings.lags_nanos.clone(), ..SyncSettings::default() };
         let lags_nanos = sync.with_offsets_of(&rig.cameras).with_offsets_of(&holdout).lags_nanos;
@@ -113,11 +114,14 @@ impl Replay {
         let fps = recorded.map_or(settings.fps, |(fps, _)| fps);
         let selection = FrameSelection { footage, fps, frames: settings.frames.clone(), lags_nanos };
         let with_masks = settings.true_masks || settings.session.perception.masks == Origin::Given;
+        if let (Origin::Given, Some(root)) = (settings.session.perception.masks, selection.footage.folder()) {
+            dataset::require_given_masks(root, &rig, "estimate them with --masks estimated")?;
+        }
         let (sets, in_folder) = selection.open_sets(&rig, with_masks)?;
         let count = recorded.map_or(in_folder, |(_, count)| count);
         let truth = TruthReader::open(&selection, &holdout)?;
         let perceived = &settings.session.perception;
-        let plates = dataset::load_plates(&dataset::plate_folder(&settings.dataset, perceived), &rig)?;
+        let plates = dataset::load_plates_of(&settings.dataset, perceived, &rig)?;
         dataset::require_masks(perceived, &plates)?;
         let first = || first_sets(selection.open_sets(&rig, with_masks)?.0, fps, count);
         let mut builder = SessionBuilder::new(gpu.clone(), rig.clone()).settings(settings.session.clone());

@@ -20,6 +20,7 @@ use flyrig_gpu::GpuContext;
 use flyrig_types::CameraId;
 
 use crate::{
+    image_origin::ImageOrigin,
     metrics_text::{self, KeyDays},
     page_server::PageServer,
     rate_watch::RateWatch,
@@ -57,6 +58,7 @@ pub struct Monitor {
     logged: BTreeMap<String, (u64, bool)>,
     /// Cameras that were reported as silent.
     silent: BTreeSet<CameraId>,
+    origin: ImageOrigin,
     rates: RateWatch,
     /// Status that the service manager has.
     status: String,
@@ -82,8 +84,15 @@ impl Monitor {
             let health = Health { resident_mib: resident_mib(), ..Health::default() };
             metrics.publish(metrics_text::prometheus(&health, None, KeyDays::default()));
         }
-        let (reported, watchdog, logged, silent, rates, status, keys, key_days) = Default::default();
-        Ok(Self { metrics, show_table, reported, watchdog, logged, silent, rates, status, keys, key_days })
+        let (reported, watchdog, logged, silent, origin, rates, status, keys, key_days) = Default::default();
+        Ok(Self { metrics, show_table, reported, watchdog, logged, silent, origin, rates, status, keys, key_days })
+    }
+
+    /// Sets where the images come from, which decides the advice on silent cameras and stuck threads.
+    #[must_use]
+    pub fn with_origin(mut self, origin: ImageOrigin) -> Self {
+        self.origin = origin;
+        self
     }
 
     /// Shows when the keys in this folder end, if it is not empty.
@@ -160,7 +169,8 @@ impl Monitor {
             let name = &camera.stats.camera;
             match table::silence_s(camera) {
                 Some(seconds) if !was_busy && self.silent.insert(name.clone()) => tracing::warn!(
-                    "camera {name}: no frame for {seconds:.0} s, and no error either; look at its trigger, its cable and its bus"
+                    "camera {name}: no frame for {seconds:.0} s, and no error either; {}",
+                    self.origin.silence_advice()
                 ),
                 None if self.silent.remove(name) => tracing::info!("camera {name}: frames come again"),
                 _ => {}
@@ -179,9 +189,7 @@ impl Monitor {
         let seconds = STUCK_AFTER.as_secs();
         for thread in &health.stuck {
             if !std::mem::replace(&mut self.logged.entry(thread.clone()).or_default().1, true) {
-                tracing::error!(
-                    "thread '{thread}' made no turn for {seconds} s; unplug its camera and plug it in again"
-                );
+                tracing::error!("thread '{thread}' made no turn for {seconds} s; {}", self.origin.stuck_advice());
             }
         }
         for (thread, (_, is_stuck)) in &mut self.logged {

@@ -57,8 +57,8 @@ impl PageServer {
     /// Names the address when it is taken.
     pub fn start(option: &str, address: &str, kind: &'static str) -> Result<Self> {
         let bounds = Bounds { connections: CONNECTIONS, per_address: false, is_streaming: false };
-        let listener =
-            Listener::bind(address, bounds).with_context(|| format!("{option}: cannot listen on {address}"))?;
+        let listener = Listener::bind(address, bounds)
+            .with_context(|| format!("{option}: cannot listen on {address}; free the port or name another one"))?;
         let page = Arc::new(Page { text: Mutex::default(), kind });
         let listener = listener.start("page", Arc::clone(&page))?;
         Ok(Self { page, listener })

@@ -2,7 +2,7 @@
 
 use std::path::Path;
 
-use anyhow::Result;
+use anyhow::{Result, ensure};
 use flyrig_avatar::Avatar;
 use flyrig_body::Template;
 use flyrig_fusion::{AppearanceOptions, BodySettings, BudgetSettings, SessionSettings};
@@ -13,6 +13,7 @@ use crate::arguments::DatasetArgs;
 
 /// Loads an avatar.
 pub(super) fn load(path: &Path) -> Result<Avatar> {
+    ensure!(path.exists(), "{} does not exist; `flyrig avatar build` makes an avatar", path.display());
     Ok(Avatar::load(path)?)
 }
 

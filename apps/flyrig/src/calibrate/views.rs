@@ -15,7 +15,7 @@ use flyrig_fusion::{InputFormat, Intake};
 use flyrig_gpu::GpuContext;
 use flyrig_report::{arguments::parse_seconds, progress_bar, stop};
 use flyrig_sync::SyncSettings;
-use flyrig_takes::{Footage, Needs, Take, TakeOptions};
+use flyrig_takes::{Footage, Needs, Take, TakeOptions, require_inputs};
 use flyrig_types::{CameraId, FrameSet};
 use rayon::prelude::*;
 
@@ -75,6 +75,7 @@ pub fn open_frames(args: &BoardTakeArgs, gpu: &dyn Fn() -> Result<GpuContext>) -
 /// # Errors
 /// Names the take, and the board's file with what is wrong in it.
 pub fn load_board(board: &Path, take: &BoardTakeArgs) -> Result<Board> {
+    require_inputs(&take.source.input)?;
     Board::load(board).with_context(|| {
         let inputs: Vec<_> = take.source.input.iter().map(|path| path.display().to_string()).collect();
         format!("cannot search {} for a board", inputs.join(", "))
