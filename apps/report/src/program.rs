@@ -24,7 +24,10 @@ pub fn start_log(verbose: u8, json: bool) {
     let level = match verbose {
         // An image without a board is no reason for a warning.
         0 => {
-            "warn,flyrig=info,flyrig_fusion=info,zenoh=error,calib_targets_chessboard=error,calib_targets_charuco=error"
+            // What graphics and windows have to say comes as errors of ours.
+            "warn,flyrig=info,flyrig_fusion=info,zenoh=error,calib_targets_chessboard=error,calib_targets_charuco=error,\
+             wgpu=off,wgpu_core=off,wgpu_hal=off,naga=off,winit=off,eframe=off,egui=off,egui_wgpu=off,egui_winit=off,\
+             smithay_client_toolkit=off,sctk=off,calloop=off"
         }
         1 => {
             "info,flyrig=debug,flyrig_fusion=debug,flyrig_capture=debug,flyrig_sync=debug,flyrig_calib=debug,\
