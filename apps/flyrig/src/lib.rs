@@ -67,7 +67,11 @@ pub fn check_simulator(text: &str) -> Result<(), String> {
 #[allow(unsafe_code)]
 pub fn main() -> ExitCode {
     // SAFETY: no other thread runs yet.
-    unsafe { flyrig_transport::use_one_network_thread() };
+    unsafe {
+        flyrig_transport::use_one_network_thread();
+        // Mesa's layer for desktops with several adapters complains of a missing desktop in every program; `--adapter` chooses here.
+        std::env::set_var("NODEVICE_SELECT", "1");
+    }
     let cli = Cli::parse();
     program::start_log(cli.program.verbose, cli.log_json);
     program::exit_code(traced(cli.program.trace.as_deref(), || dispatch(&cli)))

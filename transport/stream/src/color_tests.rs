@@ -257,7 +257,9 @@ fn a_viewer_that_joins_gets_all_layers_whole_whatever_the_budget() {
     assert!(rms(&mut joins, &encoded, &colors) < 0.6 * 2.0);
     // Who joins at a relay gets the relay's state.
     let mut second = ColorDecoder::new(&encoded.template);
-    joins.whole(0).iter().for_each(|(_, message)| drop(second.ingest(message).unwrap()));
+    for (_, message) in joins.whole(0) {
+        second.ingest(&message).unwrap();
+    }
     let (mut a, mut b) = (Vec::new(), Vec::new());
     joins.colors(&mut a);
     second.colors(&mut b);
@@ -302,7 +304,9 @@ fn changes_that_overtake_a_whole_state_are_applied_on_top_and_late_ones_are_not(
         }
     }
     assert!(held.iter().any(|(layer, _)| *layer == 2));
-    held.iter().for_each(|(_, message)| drop(early.ingest(message).unwrap()));
+    for (_, message) in &held {
+        early.ingest(message).unwrap();
+    }
     let (mut a, mut b) = (Vec::new(), Vec::new());
     follower.colors(&mut a);
     early.colors(&mut b);
@@ -310,7 +314,9 @@ fn changes_that_overtake_a_whole_state_are_applied_on_top_and_late_ones_are_not(
     // A state overtakes changes that it contains: these are left out.
     let mut next = encoder.clone();
     let messages = next.encode(stamp(12), &person.colors(1.5));
-    next.whole(0).iter().for_each(|(_, message)| drop(early.ingest(message).unwrap()));
+    for (_, message) in next.whole(0) {
+        early.ingest(&message).unwrap();
+    }
     for message in &messages {
         early.ingest(message).unwrap();
         follower.ingest(message).unwrap();
@@ -319,7 +325,9 @@ fn changes_that_overtake_a_whole_state_are_applied_on_top_and_late_ones_are_not(
     early.colors(&mut b);
     assert!(a == b);
     // Without kept messages back to the state, refreshes repair the rest.
-    held.iter().for_each(|(_, message)| drop(late.ingest(message).unwrap()));
+    for (_, message) in &held {
+        late.ingest(message).unwrap();
+    }
     assert_eq!(late.known(2), 1.0);
 }
 
@@ -336,7 +344,9 @@ fn a_slow_rig_sends_whole_changes_with_each_set() {
             let stamp = Stamp { frame, capture_nanos: period_nanos * frame as i64, ..Stamp::default() };
             let messages = encoder.encode(stamp, &person.colors(0.5 * frame as f32));
             bytes = messages.iter().map(Vec::len).sum();
-            messages.iter().for_each(|message| drop(decoder.ingest(message).unwrap()));
+            for message in &messages {
+                decoder.ingest(message).unwrap();
+            }
         }
         assert_eq!(bytes > 6000 + 2 * 60, is_slow, "{bytes}");
         assert!(bytes <= 8 * 6000 + 2 * 60);

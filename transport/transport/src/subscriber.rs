@@ -227,6 +227,12 @@ impl Subscriber {
         self.people.ask_template(hash, timeout)
     }
 
+    /// Fetches the present colours of a person whose template [`Self::template`] returned; they come through [`Self::next_person`]. Never
+    /// waits.
+    pub fn fetch_colors(&self, person: u32) {
+        self.people.template_taken(&[person]);
+    }
+
     /// Starts a fetcher of templates, which works in parallel to this subscriber.
     ///
     /// # Errors

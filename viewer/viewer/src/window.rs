@@ -163,8 +163,18 @@ pub fn open_window(options: ViewOptions, gpu: &GpuContext) -> Result<Option<Scre
             Ok(Box::new(view))
         }),
     );
-    opened.map_err(|error| ViewerError::Window(error.to_string()))?;
+    opened.map_err(|error| ViewerError::Window(in_plain_words(&error)))?;
     Ok(lock(&shot).take())
+}
+
+/// Returns the error without places in the source of libraries.
+fn in_plain_words(error: &eframe::Error) -> String {
+    match error {
+        eframe::Error::Winit(_) | eframe::Error::WinitEventLoop(_) => {
+            "the desktop that DISPLAY or WAYLAND_DISPLAY names does not answer".to_owned()
+        }
+        error => error.to_string(),
+    }
 }
 
 /// State of the screen.

@@ -27,7 +27,7 @@ const RISES: f32 = 0.004;
 const EVERY: usize = 2;
 /// Brightness of the disc's centre relative to the backdrop, sRGB codes; and factor of the darkest shadow.
 const LIGHT: f32 = 46.0;
-const DARKEST: f32 = 0.25;
+const DARKEST: f32 = 0.3;
 
 /// Floor of a rig.
 #[derive(Debug, Clone, PartialEq)]
@@ -97,7 +97,7 @@ impl Floor {
             soften(&mut self.sums);
         }
         for (shadow, sum) in self.shadow.iter_mut().zip(&self.sums) {
-            *shadow = (255.0 * (1.0 - (-1.5 * sum).exp())) as u8;
+            *shadow = (255.0 * (1.0 - (-sum).exp())) as u8;
         }
     }
 

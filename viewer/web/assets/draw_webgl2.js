@@ -107,7 +107,7 @@ vec3 behind() {
   vec2 at = vec2(dot(hit, ground[1].xyz), dot(hit, ground[2].xyz));
   float fade = max(1.0 - dot(at, at) / (radius * radius), 0.0);
   float dark = texture(shadow, at / (2.0 * ground[1].w) + 0.5).r * sqrt(fade);
-  return (background + ${46 / 255} * fade * fade) * (1.0 - 0.75 * dark);
+  return (background + ${46 / 255} * fade * fade) * (1.0 - 0.7 * dark);
 }
 vec3 srgb(vec3 c) {
   c = clamp(c, 0.0, 1.0);

@@ -27,7 +27,7 @@ fn behind(pixel: vec2<f32>) -> vec3<f32> {
   let at = vec2(dot(hit, view.ground[1].xyz), dot(hit, view.ground[2].xyz));
   let fade = max(1.0 - dot(at, at) / (radius * radius), 0.0);
   let dark = textureSampleLevel(shadow, linear, at / (2.0 * view.ground[1].w) + 0.5, 0.0).r * sqrt(fade);
-  return (view.background.rgb + ${46 / 255} * fade * fade) * (1.0 - 0.75 * dark);
+  return (view.background.rgb + ${46 / 255} * fade * fade) * (1.0 - 0.7 * dark);
 }
 @vertex fn whole(@builtin(vertex_index) index: u32) -> @builtin(position) vec4<f32> {
   return vec4(vec2<f32>(vec2(index & 1u, index >> 1u)) * 4.0 - 1.0, 0.0, 1.0);

@@ -328,6 +328,9 @@ function tick(time) {
     drawing.draw(floats(wasm.camera(), 19), BACKGROUND, ordered);
   });
   [uploaded, dirty] = [true, false];
+  const matrix = floats(wasm.camera(), 16);
+  const eye = [0, 4, 8].map(column => -(matrix[column] * matrix[12] + matrix[column + 1] * matrix[13] + matrix[column + 2] * matrix[14]));
+  document.documentElement.dataset.eye = eye.map(metres => metres.toFixed(3)).join(" ");
   document.documentElement.dataset.frame = wasm.frame();
   document.documentElement.dataset.drawing = drawing.kind;
   drawn.push(time);

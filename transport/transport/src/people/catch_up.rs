@@ -27,7 +27,7 @@ const MAX_WAITING: usize = 64;
 const PATIENCE: Duration = Duration::from_secs(5);
 const COLORS_PATIENCE: Duration = Duration::from_secs(30);
 /// Pause before a query that was not answered is repeated, and largest number of repetitions: the first colours of a person come after the
-/// template, and older rigs never answer.
+/// template, motions may come in a moment, and older rigs never answer.
 const RETRY: Duration = Duration::from_millis(500);
 const MOST_TRIES: u32 = 20;
 /// Longest wait of the thread.
@@ -135,7 +135,8 @@ impl Link {
         for (person, age, bytes) in unpack_motions(&packed) {
             self.hand_over(keys::motion_label(person), MessageKind::Motion, bytes, age);
         }
-        Ok(true)
+        // A relay, or a rig, may have its first person in a moment.
+        Ok(!packed.is_empty())
     }
 
     fn fetch_colors(&self, person: u32, first_layer: usize) -> Result<bool, TransportError> {

@@ -195,7 +195,9 @@ impl Standing {
     /// Returns the colours that a decoder ought to have.
     fn expected(&self) -> Vec<[f32; 4]> {
         let mut decoder = ColorDecoder::new(&self.encoded.template);
-        self.colors.whole(0).iter().for_each(|(_, message)| drop(decoder.ingest(message).unwrap()));
+        for (_, message) in self.colors.whole(0) {
+            decoder.ingest(&message).unwrap();
+        }
         let mut colors = Vec::new();
         decoder.colors(&mut colors);
         colors
@@ -262,7 +264,7 @@ fn a_viewer_that_misses_changes_of_a_slow_rig_gets_the_present_colours() {
     let subscriber = open_subscriber(&publisher, &people());
     watch_until_whole(&subscriber, &standing);
     wait_until("all layers", || {
-        drop(subscriber.next_person(Duration::from_millis(20)));
+        let _ = subscriber.next_person(Duration::from_millis(20));
         subscriber.color_layers() == LAYERS
     });
     // Two sets of which the reader sees the second alone: the first one's changes are replaced in its inbox.
