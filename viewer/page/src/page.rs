@@ -113,6 +113,8 @@ impl Page {
             self.navigation = Some(Navigation::new(&rig));
             self.floor = Some(Floor::new(&rig));
             self.rig = Some(rig);
+            // The people who came before it stand on its floor.
+            self.is_stale = true;
         }
         Ok(())
     }

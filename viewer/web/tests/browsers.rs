@@ -459,9 +459,11 @@ fn browsers_that_join_between_two_rare_frame_sets_see_the_person_whole() {
     let mut open = Vec::new();
     for _ in 0..2 {
         let (mut socket, mut page) = (browser(server.address(), ""), Page::default());
-        watch(&mut socket, &mut page, "a whole person", |page, _| page.people_shown() == 1 && page.is_complete());
+        let has_floor = |page: &Page| page.floor().is_some_and(|floor| floor.numbers()[3] > 0.0);
+        watch(&mut socket, &mut page, "a whole person on the floor", |page, _| {
+            page.people_shown() == 1 && page.is_complete() && has_floor(page)
+        });
         assert!(page.colors().iter().all(|color| (color[0] - 0.5).abs() < 0.05 && (color[2] - 0.1).abs() < 0.05));
-        assert!(page.floor().is_some_and(|floor| floor.numbers()[3] > 0.0));
         page.choose(4);
         assert_eq!((page.person(0), page.person(1)), (Some(4), None));
         open.push((socket, page));
