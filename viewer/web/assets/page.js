@@ -140,6 +140,12 @@ function button(label, act, icon) {
   return made;
 }
 
+function label(words) {
+  const made = document.createElement("span");
+  made.textContent = words;
+  return made;
+}
+
 let follows = parameters.has("follow");
 let cameraNames = [];
 let peopleShown = [];
@@ -186,7 +192,7 @@ function showCameras(names) {
     made.title = `Stand at camera ${name}${at < 9 ? ` (${at + 1})` : ""}`;
     return made;
   };
-  cameras.replaceChildren(...names.map(camera));
+  cameras.replaceChildren(label("camera"), ...names.map(camera));
   reset();
 }
 
@@ -195,8 +201,12 @@ function showPeople(count) {
   const shown = Array.from({ length: count }, (_, index) => wasm.person(index)).filter(person => person >= 0);
   if (shown.join() === peopleShown.join()) return;
   peopleShown = shown;
-  const choose = person => button(`Person ${person + 1}`, () => { glide = [0, 0]; wasm.choose(person); });
-  people.replaceChildren(...(shown.length > 1 ? shown.map(choose) : []));
+  const choose = person => {
+    const made = button(`${person}`, () => { glide = [0, 0]; wasm.choose(person); });
+    made.title = `Look at person ${person}`;
+    return made;
+  };
+  people.replaceChildren(...(shown.length > 1 ? [label("person"), ...shown.map(choose)] : []));
 }
 
 // --- Pointers and keys ---
