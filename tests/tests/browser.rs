@@ -330,3 +330,153 @@ fn a_browser_without_webgl2_shows_the_reason() {
         text.as_str().is_some_and(|text| text.contains("This browser has no WebGL2"))
     });
 }
+
+/// JavaScript expression for the page's message, and for its line on what is shown.
+const MESSAGE: &str = "document.getElementById('trouble')?.textContent ?? ''";
+const LINE: &str = "document.getElementById('state')?.textContent ?? ''";
+/// JavaScript expression for the position of the page's camera, metres.
+const EYE: &str = "document.documentElement.dataset.eye?.split(' ').map(Number) ?? []";
+
+impl Browser {
+    fn text(&mut self, expression: &str) -> String {
+        self.evaluate(expression).as_str().unwrap_or_default().to_owned()
+    }
+
+    fn eye(&mut self) -> Vec<f64> {
+        self.evaluate(EYE).as_array().map(|eye| eye.iter().filter_map(Value::as_f64).collect()).unwrap_or_default()
+    }
+
+    fn mouse(&mut self, kind: &str, [x, y]: [u32; 2]) {
+        let buttons = u32::from(kind != "mouseReleased");
+        let event = json!({ "type": kind, "x": x, "y": y, "button": "left", "buttons": buttons, "clickCount": 1 });
+        self.call("Input.dispatchMouseEvent", &event);
+    }
+
+    /// Drags from the middle to the right.
+    fn drag(&mut self, [width, height]: [u32; 2]) {
+        let from = [width / 2, height / 2];
+        self.mouse("mousePressed", from);
+        (1..8).for_each(|step| self.mouse("mouseMoved", [from[0] + 12 * step, from[1] + 2 * step]));
+        self.mouse("mouseReleased", [from[0] + 84, from[1] + 14]);
+    }
+
+    fn press(&mut self, key: &str) {
+        for kind in ["rawKeyDown", "keyUp"] {
+            let event = json!({ "type": kind, "key": key, "code": format!("Key{}", key.to_uppercase()) });
+            self.call("Input.dispatchKeyEvent", &event);
+        }
+    }
+
+    /// Waits until the camera stands still, and returns its position.
+    fn settled(&mut self) -> Vec<f64> {
+        let mut last = Vec::new();
+        wait_until("a camera that stands still", || {
+            std::thread::sleep(Duration::from_millis(700));
+            let eye = self.eye();
+            !eye.is_empty() && std::mem::replace(&mut last, eye.clone()) == eye
+        });
+        last
+    }
+}
+
+fn apart(a: &[f64], b: &[f64]) -> f64 {
+    a.iter().zip(b).map(|(a, b)| (a - b).powi(2)).sum::<f64>().sqrt()
+}
+
+#[test]
+#[ignore = "needs Chromium; make test-browser"]
+fn a_page_that_shows_a_person_obeys_pointers_and_keys_and_comes_back() {
+    let folder = tempfile::tempdir().unwrap();
+    let port = || std::net::TcpListener::bind("127.0.0.1:0").unwrap().local_addr().unwrap().port();
+    let (web, debugging) = (port(), port());
+    let endpoint = small_rig("browser", folder.path(), "");
+    // One set in five seconds.
+    std::fs::write(folder.path().join("sim.toml"), "width = 96\nheight = 96\ntexture_px = 128\nfps = 0.2\n").unwrap();
+    let _rig = Process::start(PROGRAM, &["run", "rig.toml"], folder.path(), "run");
+    let listen = format!("127.0.0.1:{web}");
+    let serve = || {
+        let args = ["serve", "--connect", &endpoint, "--rig", "browser", "--listen", &listen];
+        Process::start(PROGRAM, &args, folder.path(), "serve")
+    };
+    let server = serve();
+    wait_until("the page", || TcpStream::connect(("127.0.0.1", web)).is_ok());
+    let size = [900, 600];
+    let mut browser = Browser::open(&format!("http://{listen}/"), folder.path(), debugging, WEBGL2);
+    let device = json!({ "width": size[0], "height": size[1], "deviceScaleFactor": 1, "mobile": false });
+    browser.call("Emulation.setDeviceMetricsOverride", &device);
+    let ready = |browser: &mut Browser| {
+        wait_until("a whole person", || browser.evaluate("document.documentElement.dataset.ready") == "yes");
+    };
+    ready(&mut browser);
+    // A slow rig is no slow line, and the age is that of a set of such a rig.
+    let line = browser.text(LINE);
+    assert!(line.starts_with("live") && !line.contains("slow"), "{line}");
+
+    let start = browser.settled();
+    browser.drag(size);
+    let turned = browser.settled();
+    assert!(apart(&start, &turned) > 0.3, "{start:?} {turned:?}");
+    browser.press("r");
+    wait_until("the viewpoint of the start", || apart(&browser.eye(), &start) < 0.01);
+
+    let distance = |browser: &mut Browser| apart(&browser.settled(), &[0.0, 0.0, 0.93]);
+    let far = distance(&mut browser);
+    for delta in [10_000, -10_000] {
+        for _ in 0..40 {
+            let wheel = json!({ "type": "mouseWheel", "x": 450, "y": 300, "deltaX": 0, "deltaY": delta });
+            browser.call("Input.dispatchMouseEvent", &wheel);
+        }
+        let found = distance(&mut browser);
+        assert!((0.2..4.0 * far).contains(&found), "{delta}: {found} m of {far}");
+    }
+    browser.press("r");
+    wait_until("the viewpoint of the start", || apart(&browser.eye(), &start) < 0.01);
+    let touch = json!({ "enabled": true, "maxTouchPoints": 2 });
+    browser.call("Emulation.setTouchEmulationEnabled", &touch);
+    for spread in [200, 5, 0, 250] {
+        let points = |by: i32| json!([{ "x": 450 - by, "y": 300, "id": 0 }, { "x": 450 + by, "y": 300, "id": 1 }]);
+        for (kind, points) in [("touchStart", points(100)), ("touchMove", points(spread)), ("touchEnd", json!([]))] {
+            browser.call("Input.dispatchTouchEvent", &json!({ "type": kind, "touchPoints": points }));
+        }
+    }
+    let found = distance(&mut browser);
+    assert!((0.2..4.0 * far).contains(&found), "{found} m of {far}");
+
+    browser.press("h");
+    wait_until("details", || browser.text("document.getElementById('details').textContent").contains("rig browser"));
+    browser.press("h");
+    assert_eq!(browser.evaluate("document.getElementById('help').hidden"), true);
+
+    // The server ends and comes again.
+    drop(server);
+    wait_until("words about the server", || browser.text(MESSAGE).contains("trying again"));
+    // The message takes no drag, and no text is selected.
+    let center = "document.getElementById('trouble').getBoundingClientRect()";
+    let under = format!("(b => document.elementFromPoint(b.x + b.width / 2, b.y + b.height / 2).id)({center})");
+    assert_eq!(browser.text(&under), "view");
+    let before = browser.settled();
+    browser.drag(size);
+    assert!(apart(&browser.settled(), &before) > 0.3);
+    assert_eq!(browser.text("getSelection().toString()"), "");
+    let _server = serve();
+    ready(&mut browser);
+}
+
+#[test]
+#[ignore = "needs Chromium; make test-browser"]
+fn a_page_without_a_rig_says_so_and_is_dragged_through_its_message() {
+    let folder = tempfile::tempdir().unwrap();
+    let port = || std::net::TcpListener::bind("127.0.0.1:0").unwrap().local_addr().unwrap().port();
+    let (web, debugging) = (port(), port());
+    let listen = format!("127.0.0.1:{web}");
+    let args = ["serve", "--connect", "tcp/127.0.0.1:1", "--listen", &listen];
+    let _server = Process::start(PROGRAM, &args, folder.path(), "serve");
+    wait_until("the page", || TcpStream::connect(("127.0.0.1", web)).is_ok());
+    let mut browser = Browser::open(&format!("http://{listen}/"), folder.path(), debugging, WEBGL2);
+    wait_until("words about the rig", || browser.text(MESSAGE).starts_with("No rig 'flyrig' yet"));
+    assert_eq!(browser.text(LINE), "");
+    browser.drag([800, 600]);
+    assert_eq!(browser.text("getSelection().toString()"), "");
+    browser.call("Runtime.evaluate", &json!({ "expression": "document.execCommand('selectAll')" }));
+    assert_eq!(browser.text("getSelection().toString()").trim(), "");
+}

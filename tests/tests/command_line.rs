@@ -115,3 +115,55 @@ fn a_demo_goes_through_every_fault_of_a_rig() {
     assert_eq!(refused.code, Some(1));
     assert!(refused.stderr.contains("bad.toml") && refused.stderr.contains("fault.mm is 3"), "{}", refused.stderr);
 }
+
+#[test]
+fn a_window_without_a_desktop_is_refused_in_six_words() {
+    let folder = tempfile::tempdir().unwrap();
+    let output = std::process::Command::new(PROGRAM)
+        .args(["view"])
+        .current_dir(folder.path())
+        .env_remove("DISPLAY")
+        .env_remove("WAYLAND_DISPLAY")
+        .env_remove("WAYLAND_SOCKET")
+        .env_remove("XDG_RUNTIME_DIR")
+        .output()
+        .unwrap();
+    assert_eq!(output.status.code(), Some(1));
+    assert_eq!(String::from_utf8_lossy(&output.stderr), "error: no desktop here: use flyrig watch\n");
+    let refused = run(PROGRAM, &["view", "--wait", "5"], folder.path()).unwrap();
+    assert!(refused.stderr.contains("--screenshot"), "{}", refused.stderr);
+}
+
+#[test]
+fn a_desktop_that_does_not_answer_is_named_without_words_of_libraries() {
+    let folder = tempfile::tempdir().unwrap();
+    let output = std::process::Command::new(PROGRAM)
+        .args(["view"])
+        .current_dir(folder.path())
+        .env("DISPLAY", ":987")
+        .env_remove("WAYLAND_DISPLAY")
+        .env_remove("WAYLAND_SOCKET")
+        .env_remove("XDG_RUNTIME_DIR")
+        .output()
+        .unwrap();
+    assert_eq!(output.status.code(), Some(1));
+    let text = String::from_utf8_lossy(&output.stderr);
+    let lines: Vec<&str> = text.lines().collect();
+    assert_eq!(lines.len(), 2, "{text}");
+    assert!(lines[0].starts_with("view: rig 'flyrig' at"), "{text}");
+    let expected = "error: cannot open a window: the desktop that DISPLAY or WAYLAND_DISPLAY names does not answer";
+    assert!(lines[1].starts_with(expected), "{text}");
+}
+
+#[test]
+fn libraries_write_nothing_to_the_terminal() {
+    let folder = tempfile::tempdir().unwrap();
+    // Opens the graphics adapter.
+    let output = std::process::Command::new(PROGRAM)
+        .args(["doctor"])
+        .current_dir(folder.path())
+        .env_remove("XDG_RUNTIME_DIR")
+        .output()
+        .unwrap();
+    assert_eq!(String::from_utf8_lossy(&output.stderr), "");
+}

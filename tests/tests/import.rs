@@ -53,9 +53,8 @@ fn what_is_wrong_in_a_take_is_measured_and_corrected() {
     println!("{}", imported.stdout);
 
     let truth = rig(&folder.path().join("raw/truth"));
-    let worst = |rig: &Rig| {
-        rig_errors(&rig.cameras, &truth.cameras).unwrap().iter().map(|error| error.px).fold(0.0, f64::max)
-    };
+    let worst =
+        |rig: &Rig| rig_errors(&rig.cameras, &truth.cameras).unwrap().iter().map(|error| error.px).fold(0.0, f64::max);
     let take = folder.path().join("take");
     let (before, after) = (worst(&rig(&folder.path().join("raw"))), worst(&rig(&take)));
     assert!(before > 4.0 && after < 0.4 * before, "{before} px before, {after} px after\n{}", imported.stdout);

@@ -79,7 +79,7 @@ fn a_viewer_draws_the_person_as_the_rig_does_live_and_from_a_recording() {
     assert!(psnr > 28.0, "{psnr}");
     let shown = ours.rgba.chunks_exact(4).filter(|pixel| pixel[3] > 127).count();
     assert!(shown > 300, "{shown} pixels");
-    // A recording that begins in the middle of the stream is complete once every segment was refreshed.
+    // A recording of a few seconds.
     let captured = || receiver.state().people.get(0)?.motion_at(clock_secs(), false).map(|m| m.stamp.capture_nanos);
     let start = captured().unwrap();
     wait_until("a recording longer than a refresh", || captured().is_some_and(|now| now > start + 4_000_000_000));

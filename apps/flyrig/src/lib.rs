@@ -121,7 +121,7 @@ fn dispatch(cli: &Cli) -> Result<()> {
         Command::Plate(args) => plate::plate(args, &|| open_gpu(cli.program.adapter.as_deref())),
         Command::Calibrate { action } => calibrate::calibrate(action, &|| open_gpu(cli.program.adapter.as_deref())),
         Command::Doctor { config } => doctor::doctor(config.as_deref()),
-        Command::View(args) => view::view(args, &open_gpu(cli.program.adapter.as_deref())?),
+        Command::View(args) => view::view(args, || open_gpu(cli.program.adapter.as_deref())),
         Command::Serve(args) => serve::serve(args),
         Command::Watch(args) => match &args.record {
             Some(path) => stream_recording::record(args, path),

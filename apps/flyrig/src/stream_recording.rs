@@ -81,6 +81,8 @@ impl Writer<'_> {
             let Some(template) = self.subscriber.template(stamp.template, TEMPLATE_PATIENCE)? else { return Ok(()) };
             self.put(TEMPLATE, *person, stamp.capture_nanos, &template);
             self.templates.insert(stamp.template);
+            // A recording that begins in the middle of the stream has all colours from the start.
+            self.subscriber.fetch_colors(*person);
         }
         self.motions += u64::from(layer.is_none());
         let kind = layer.and_then(|layer| u8::try_from(layer).ok()).unwrap_or(MOTION);

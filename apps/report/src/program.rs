@@ -42,8 +42,10 @@ pub fn start_log(verbose: u8, json: bool) {
         // An image without a board is no reason for a warning, and what the libraries below report as a problem of theirs is reported
         // again as an error of ours.
         0 => {
+            // What graphics and windows have to say comes as errors of ours.
             "warn,flyrig=info,flyrig_fusion=info,zenoh=error,calib_targets_chessboard=error,calib_targets_charuco=error,\
-             wgpu=off,naga=off,winit=off"
+             wgpu=off,wgpu_core=off,wgpu_hal=off,naga=off,winit=off,eframe=off,egui=off,egui_wgpu=off,egui_winit=off,\
+             smithay_client_toolkit=off,sctk=off,calloop=off"
         }
         1 => {
             "info,flyrig=debug,flyrig_fusion=debug,flyrig_capture=debug,flyrig_sync=debug,flyrig_calib=debug,\

@@ -5,8 +5,8 @@
 use std::{vec, vec::Vec};
 
 use crate::{
-    ColorDecoder, ColorEncoder, ColorSettings, EncodedTemplate, LAYERS, Motion, MotionEncoder, Stamp, restamp,
-    stamp_of,
+    ColorDecoder, ColorEncoder, ColorSettings, EncodedTemplate, LAYERS, Motion, MotionEncoder, Stamp, WholeColors,
+    restamp, stamp_of,
     testing::{Person, damaged},
 };
 
@@ -231,4 +231,146 @@ fn what_is_played_again_is_as_new() {
     let back = Motion::decode(&motion, &encoded.template).unwrap();
     assert_eq!(back.stamp, Stamp { capture_nanos: 99, ..stamp_of(&motion).unwrap() });
     assert!(restamp(&mut motion[..20], 1, 0).is_err() && restamp(&mut [], 1, 0).is_err());
+}
+
+#[test]
+fn a_viewer_that_joins_gets_all_layers_whole_whatever_the_budget() {
+    let person = Person::tube(20_000, 0);
+    let encoded = person.encode();
+    // The budget of a frame holds a small part of a new person.
+    let settings = ColorSettings { step: 2.0, max_frame_bytes: 3000, ..ColorSettings::default() };
+    let mut encoder = ColorEncoder::new(&encoded, settings, 1);
+    assert!(encoder.whole(0).is_empty());
+    let colors = person.colors(0.0);
+    let first = encoder.encode(stamp(0), &colors);
+    let mut follower = ColorDecoder::new(&encoded.template);
+    for message in &first {
+        follower.ingest(message).unwrap();
+    }
+    assert!(follower.known(2) < 0.5 && follower.whole(LAYERS).is_empty());
+    let mut joins = ColorDecoder::new(&encoded.template);
+    for (layer, message) in encoder.whole(0) {
+        assert!(message.len() <= crate::MAX_MESSAGE_BYTES);
+        assert_eq!(joins.ingest(&message).unwrap(), stamp_of(&first[layer]).unwrap());
+    }
+    assert_eq!([0, 1, 2].map(|layer| joins.known(layer)), [1.0; LAYERS]);
+    assert!(rms(&mut joins, &encoded, &colors) < 0.6 * 2.0);
+    // Who joins at a relay gets the relay's state.
+    let mut second = ColorDecoder::new(&encoded.template);
+    for (_, message) in joins.whole(0) {
+        second.ingest(&message).unwrap();
+    }
+    let (mut a, mut b) = (Vec::new(), Vec::new());
+    joins.colors(&mut a);
+    second.colors(&mut b);
+    assert!(a == b);
+    // All of them follow, and none has missed anything.
+    for frame in 1..40 {
+        for message in encoder.encode(stamp(frame), &person.colors(0.01 * frame as f32)) {
+            for decoder in [&mut follower, &mut joins, &mut second] {
+                decoder.ingest(&message).unwrap();
+            }
+        }
+    }
+    for decoder in [&mut joins, &mut second] {
+        decoder.colors(&mut b);
+        follower.colors(&mut a);
+        assert!(a == b && decoder.missed(0) + decoder.missed(2) == 0);
+    }
+}
+
+#[test]
+fn changes_that_overtake_a_whole_state_are_applied_on_top_and_late_ones_are_not() {
+    let person = Person::tube(6000, 0);
+    let encoded = person.encode();
+    let mut encoder = ColorEncoder::new(&encoded, ColorSettings::default(), 1);
+    let mut follower = ColorDecoder::new(&encoded.template);
+    let (mut early, mut late) = (follower.clone(), follower.clone());
+    let mut held = Vec::new();
+    for frame in 0..12 {
+        let messages = encoder.encode(stamp(frame), &person.colors(0.1 * frame as f32));
+        for message in &messages {
+            follower.ingest(message).unwrap();
+            // Subscribed in time, but asked for the state at frame 5, which arrives after frame 11.
+            if frame >= 4 {
+                early.ingest(message).unwrap();
+            }
+        }
+        if frame == 5 {
+            held = encoder.whole(0);
+        }
+        if frame >= 8 {
+            late.ingest(&messages[0]).unwrap();
+        }
+    }
+    assert!(held.iter().any(|(layer, _)| *layer == 2));
+    for (_, message) in &held {
+        early.ingest(message).unwrap();
+    }
+    let (mut a, mut b) = (Vec::new(), Vec::new());
+    follower.colors(&mut a);
+    early.colors(&mut b);
+    assert!(a == b && early.missed(0) == 0);
+    // A state overtakes changes that it contains: these are left out.
+    let mut next = encoder.clone();
+    let messages = next.encode(stamp(12), &person.colors(1.5));
+    for (_, message) in next.whole(0) {
+        early.ingest(&message).unwrap();
+    }
+    for message in &messages {
+        early.ingest(message).unwrap();
+        follower.ingest(message).unwrap();
+    }
+    follower.colors(&mut a);
+    early.colors(&mut b);
+    assert!(a == b);
+    // Without kept messages back to the state, refreshes repair the rest.
+    for (_, message) in &held {
+        late.ingest(message).unwrap();
+    }
+    assert_eq!(late.known(2), 1.0);
+}
+
+#[test]
+fn a_slow_rig_sends_whole_changes_with_each_set() {
+    let person = Person::tube(20_000, 0);
+    let encoded = person.encode();
+    let settings = ColorSettings { max_frame_bytes: 6000, ..ColorSettings::default() };
+    for (period_nanos, is_slow) in [(33_000_000, false), (5_000_000_000i64, true)] {
+        let mut encoder = ColorEncoder::new(&encoded, settings, 1);
+        let mut decoder = ColorDecoder::new(&encoded.template);
+        let mut bytes = 0;
+        for frame in 0..3 {
+            let stamp = Stamp { frame, capture_nanos: period_nanos * frame as i64, ..Stamp::default() };
+            let messages = encoder.encode(stamp, &person.colors(0.5 * frame as f32));
+            bytes = messages.iter().map(Vec::len).sum();
+            for message in &messages {
+                decoder.ingest(message).unwrap();
+            }
+        }
+        assert_eq!(bytes > 6000 + 2 * 60, is_slow, "{bytes}");
+        assert!(bytes <= 8 * 6000 + 2 * 60);
+        assert_eq!(decoder.known(2) >= 1.0, is_slow);
+    }
+}
+
+#[test]
+fn damaged_whole_states_are_no_panic() {
+    let person = Person::tube(2000, 0);
+    let encoded = person.encode();
+    let mut encoder = ColorEncoder::new(&encoded, ColorSettings::default(), 1);
+    let mut decoder = ColorDecoder::new(&encoded.template);
+    for message in encoder.encode(stamp(0), &person.colors(0.0)) {
+        decoder.ingest(&message).unwrap();
+    }
+    let mut found = Vec::new();
+    for (_, message) in encoder.whole(0) {
+        damaged(&message, 800, |bytes| {
+            let _ = decoder.ingest(bytes);
+            decoder.colors(&mut found);
+            assert!(found.iter().flatten().all(|v| (0.0..=1.0).contains(v)));
+        });
+    }
+    // Whatever it has learned, it can be passed on.
+    assert!(decoder.whole(0).iter().all(|(_, message)| message.len() <= crate::MAX_MESSAGE_BYTES));
 }

@@ -6,8 +6,11 @@
 //! invisible. The error of a decoder that misses a message is limited to the changes of that message.
 //!
 //! A message ends at its byte budget: the remaining segments wait for the next frame.
+//!
+//! A viewer that joins, or has missed messages, does not wait for refreshes: [`WholeColors::whole`] returns messages with the present state
+//! of all segments. Changes that overtake them are applied again on top.
 
-use alloc::{vec, vec::Vec};
+use alloc::{collections::VecDeque, vec, vec::Vec};
 use core::ops::Range;
 
 use crate::{
@@ -32,6 +35,17 @@ const WHAT: &str = "colour message";
 const CHROMA: f32 = 1.8;
 /// Rounding offset: changes below `1 - ROUND_UP` of a step count as none.
 const ROUND_UP: f32 = 0.3;
+/// Bit of a layer's number in messages of [`WholeColors::whole`], whose sequence number is that of the next message of changes.
+const WHOLE: u8 = 0x80;
+/// Frame sets per second above which the byte budget holds for a frame set, below which for the time between two of them; and the largest
+/// multiple of the budget.
+const FULL_RATE: f32 = 10.0;
+const MOST_BUDGETS: f32 = 8.0;
+/// Largest number and bytes of messages that a decoder keeps, to apply them again on top of an older whole state.
+const MAX_KEPT: usize = 96;
+const MAX_KEPT_BYTES: usize = 1 << 20;
+/// Largest number of messages by which one is late; a larger difference is a damaged number.
+const MOST_LATE: u32 = 1024;
 
 /// Settings of a [`ColorEncoder`].
 #[derive(Debug, Clone, Copy, PartialEq)]
@@ -40,7 +54,8 @@ pub struct ColorSettings {
     pub step: f32,
     /// Time within which every segment is refreshed, seconds.
     pub refresh_secs: f32,
-    /// Byte budget of a frame over all layers, which a new person, or an encoder that restarts, reaches.
+    /// Byte budget of a frame over all layers, which a new person, or an encoder that restarts, reaches. Where frames come less than ten
+    /// times per second, each may have as many bytes per second, up to eight times the budget.
     pub max_frame_bytes: usize,
 }
 
@@ -119,6 +134,67 @@ fn color_of([y, red_blue, green]: [f32; CHANNELS]) -> [f32; 3] {
     [others + 0.5 * red_blue, y + 0.5 * green, others - 0.5 * red_blue]
 }
 
+/// Source of the present state of a person's colours: the encoder, or a decoder that follows it.
+pub trait WholeColors: core::fmt::Debug + Send {
+    /// Encodes the present state of the layers from `first_layer` on: layer and message for [`ColorDecoder::ingest`], several messages per
+    /// layer where one would be too long. Empty before the first colours.
+    fn whole(&self, first_layer: usize) -> Vec<(usize, Vec<u8>)>;
+}
+
+/// State of an encoder or a decoder.
+struct State<'a> {
+    stamp: Stamp,
+    epoch: u32,
+    step: f32,
+    tree: &'a HaarTree,
+    levels: &'a [Levels],
+}
+
+impl State<'_> {
+    /// Encodes the known segments of a layer. `sequence` is that of the next message of changes.
+    fn encode_layer(&self, layer: usize, sequence: u32, is_known: impl Fn(usize) -> bool) -> Vec<Vec<u8>> {
+        let segments = self.tree.segments();
+        let mut levels = self.levels.to_vec();
+        let (mut messages, mut segment) = (Vec::new(), 0);
+        while segment < segments {
+            let first = segment;
+            let (bytes, count_at) = begin(self.stamp, (self.epoch, self.step), sequence, layer as u8 | WHOLE, first);
+            let (mut encoder, mut model) = (RangeEncoder::new(bytes), Model::default());
+            while segment < segments && is_known(segment) {
+                let mark = encoder.mark();
+                model.code(&mut encoder, self.tree, (layer, segment), true, &mut levels);
+                if encoder.len() > MAX_MESSAGE_BYTES {
+                    encoder.rewind(mark);
+                    break;
+                }
+                segment += 1;
+            }
+            if segment == first {
+                // Unknown, or too long by itself.
+                segment += 1;
+                continue;
+            }
+            let mut bytes = encoder.finish();
+            bytes[count_at] = (segment - first) as u8;
+            messages.push(bytes);
+        }
+        messages
+    }
+}
+
+/// Returns the first bytes of a message, and the place of its number of segments.
+fn begin(stamp: Stamp, (epoch, step): (u32, f32), sequence: u32, layer: u8, first: usize) -> (Vec<u8>, usize) {
+    let mut bytes = stamp.begin(COLOR_MAGIC);
+    bytes.extend(epoch.to_le_bytes());
+    bytes.extend(step.to_le_bytes());
+    bytes.extend(sequence.to_le_bytes());
+    bytes.push(layer);
+    bytes.push(first as u8);
+    let count_at = bytes.len();
+    bytes.push(0);
+    (bytes, count_at)
+}
+
 /// Encoder of the colours of one template, frame after frame.
 #[derive(Debug, Clone)]
 pub struct ColorEncoder {
@@ -133,8 +209,8 @@ pub struct ColorEncoder {
     state: Vec<Levels>,
     changes: Vec<Levels>,
     layers: [LayerState; LAYERS],
-    /// Capture time of the previous message.
-    last_nanos: Option<i64>,
+    /// Stamp of the previous messages.
+    last: Option<Stamp>,
     coefficients: Vec<[f32; 3]>,
     means: Vec<[f32; 3]>,
 }
@@ -144,8 +220,6 @@ struct LayerState {
     sequence: u32,
     /// First segment of the next message.
     first: usize,
-    /// Whether each segment has been sent.
-    is_known: Vec<bool>,
     /// Next segment to refresh, and number of refreshes that are due.
     next_refresh: usize,
     due: f32,
@@ -156,8 +230,8 @@ impl ColorEncoder {
     #[must_use]
     pub fn new(template: &EncodedTemplate, settings: ColorSettings, epoch: u32) -> Self {
         let tree = HaarTree::new(template.template.gaussians());
-        let is_known = vec![false; tree.segments()];
-        let layer = LayerState { sequence: 0, first: 0, is_known, next_refresh: 0, due: 0.0 };
+        // All segments are due at first.
+        let layer = LayerState { sequence: 0, first: 0, next_refresh: 0, due: tree.segments() as f32 };
         let settings = ColorSettings {
             step: if settings.step.is_finite() { settings.step.clamp(0.25, 128.0) } else { 8.0 },
             refresh_secs: settings.refresh_secs.max(0.1),
@@ -173,7 +247,7 @@ impl ColorEncoder {
             state: vec![[0; CHANNELS]; tree.coefficients()],
             changes: vec![[0; CHANNELS]; tree.coefficients()],
             layers: core::array::from_fn(|_| layer.clone()),
-            last_nanos: None,
+            last: None,
             coefficients: vec![[0.0; 3]; tree.coefficients()],
             means: Vec::new(),
             tree,
@@ -189,10 +263,14 @@ impl ColorEncoder {
             differences_of([r, g, b].map(|linear| self.srgb.code(linear)))
         };
         self.tree.forward(item, &mut self.coefficients, &mut self.means);
-        let elapsed = self.last_nanos.map_or(0.0, |last| stamp.capture_nanos.saturating_sub(last) as f32 / 1e9);
-        self.last_nanos = Some(stamp.capture_nanos);
+        let since = |last: Stamp| stamp.capture_nanos.saturating_sub(last.capture_nanos) as f32 / 1e9;
+        let elapsed = self.last.map_or(0.0, since);
+        if self.last.replace(stamp).is_none() {
+            self.set_all();
+        }
         let refreshed = self.tree.segments() as f32 * (elapsed / self.settings.refresh_secs).clamp(0.0, 1.0);
-        let mut left = self.settings.max_frame_bytes;
+        let budgets = (elapsed * FULL_RATE).clamp(1.0, MOST_BUDGETS);
+        let mut left = (self.settings.max_frame_bytes as f32 * budgets) as usize;
         core::array::from_fn(|layer| {
             self.layers[layer].due += refreshed;
             let message = self.encode_layer(stamp, layer, left.min(MAX_MESSAGE_BYTES));
@@ -201,17 +279,25 @@ impl ColorEncoder {
         })
     }
 
+    /// Sets the states of all segments to the first colours, so that they are whole whatever the budget is.
+    fn set_all(&mut self) {
+        for layer in 0..LAYERS {
+            for segment in 0..self.tree.segments() {
+                let (coefficients, state) = (&self.coefficients, &mut self.state);
+                each_level(&self.tree, &self.steps, layer, segment, |places, step| {
+                    let values = coefficients[places.clone()].as_flattened();
+                    for (state, value) in state[places].as_flattened_mut().iter_mut().zip(values) {
+                        *state = quantise(value / step, ROUND_UP).clamp(-MOST, MOST);
+                    }
+                });
+            }
+        }
+    }
+
     fn encode_layer(&mut self, stamp: Stamp, layer: usize, max_bytes: usize) -> Vec<u8> {
         let segments = self.tree.segments();
         let LayerState { sequence, first, .. } = self.layers[layer];
-        let mut bytes = stamp.begin(COLOR_MAGIC);
-        bytes.extend(self.epoch.to_le_bytes());
-        bytes.extend(self.settings.step.to_le_bytes());
-        bytes.extend(sequence.to_le_bytes());
-        bytes.push(layer as u8);
-        bytes.push(first as u8);
-        let count_at = bytes.len();
-        bytes.push(0);
+        let (bytes, count_at) = begin(stamp, (self.epoch, self.settings.step), sequence, layer as u8, first);
 
         let due = (self.layers[layer].due as usize).min(segments);
         let refreshes = self.layers[layer].next_refresh..self.layers[layer].next_refresh + due;
@@ -221,7 +307,7 @@ impl ColorEncoder {
         let mut count = 0;
         for i in 0..segments {
             let segment = (first + i) % segments;
-            let is_refresh = is_due(segment) || !self.layers[layer].is_known[segment];
+            let is_refresh = is_due(segment);
             let mark = encoder.mark();
             let (coefficients, state, changes) = (&self.coefficients, &self.state, &mut self.changes);
             each_level(&self.tree, &self.steps, layer, segment, |places, step| {
@@ -238,7 +324,6 @@ impl ColorEncoder {
             each_level(&self.tree, &self.steps, layer, segment, |places, _| {
                 add(&changes[places.clone()], is_refresh, &mut state[places]);
             });
-            self.layers[layer].is_known[segment] = true;
             count += 1;
         }
         let layer = &mut self.layers[layer];
@@ -255,6 +340,15 @@ impl ColorEncoder {
         let mut bytes = encoder.finish();
         bytes[count_at] = count as u8;
         bytes
+    }
+}
+
+impl WholeColors for ColorEncoder {
+    fn whole(&self, first_layer: usize) -> Vec<(usize, Vec<u8>)> {
+        let Some(stamp) = self.last else { return Vec::new() };
+        let state = State { stamp, epoch: self.epoch, step: self.settings.step, tree: &self.tree, levels: &self.state };
+        let of_layer = |layer: usize| state.encode_layer(layer, self.layers[layer].sequence, |_| true);
+        (first_layer..LAYERS).flat_map(|layer| of_layer(layer).into_iter().map(move |bytes| (layer, bytes))).collect()
     }
 }
 
@@ -290,6 +384,11 @@ pub struct ColorDecoder {
     state: Vec<Levels>,
     values: Vec<Levels>,
     layers: [DecodedLayer; LAYERS],
+    /// Stamp of the newest message.
+    last: Option<Stamp>,
+    /// Last messages of changes of this encoder, of all layers.
+    kept: VecDeque<Changes>,
+    kept_bytes: usize,
     /// Whether each segment of the coarsest layer has arrived with these steps, from an earlier encoder as well.
     is_shown: Vec<bool>,
     means: Vec<[f32; 3]>,
@@ -300,6 +399,16 @@ struct DecodedLayer {
     is_known: Vec<bool>,
     sequence: Option<u32>,
     missed: u64,
+}
+
+/// Changes of a layer, still encoded.
+#[derive(Debug, Clone)]
+struct Changes {
+    layer: usize,
+    sequence: u32,
+    first: usize,
+    count: usize,
+    bytes: Vec<u8>,
 }
 
 impl ColorDecoder {
@@ -318,6 +427,9 @@ impl ColorDecoder {
             values: vec![[0; CHANNELS]; tree.coefficients()],
             is_shown: layer.is_known.clone(),
             layers: core::array::from_fn(|_| layer.clone()),
+            last: None,
+            kept: VecDeque::new(),
+            kept_bytes: 0,
             means: Vec::new(),
             tree,
         }
@@ -335,7 +447,8 @@ impl ColorDecoder {
             return Err(StreamError::OtherTemplate { what: WHAT });
         }
         let (epoch, step, sequence) = (fields.u32()?, fields.f32()?, fields.u32()?);
-        let (layer, first, count) = (usize::from(fields.u8()?), usize::from(fields.u8()?), usize::from(fields.u8()?));
+        let (numbered, first, count) = (fields.u8()?, usize::from(fields.u8()?), usize::from(fields.u8()?));
+        let (layer, is_whole) = (usize::from(numbered & !WHOLE), numbered & WHOLE != 0);
         let segments = self.tree.segments();
         fields.check((0.25..=128.0).contains(&step), "its quantisation step makes no sense")?;
         fields.check(layer < LAYERS && first < segments && count <= segments, "it names a part that does not exist")?;
@@ -344,13 +457,43 @@ impl ColorDecoder {
         }
         let known = &mut self.layers[layer];
         let next = known.sequence.map_or(sequence, |last| last.wrapping_add(1));
-        known.missed += u64::from(sequence.wrapping_sub(next).min(1 << 16));
-        known.sequence = Some(sequence);
-        let mut decoder = RangeDecoder::new(fields.bytes);
+        let ahead = sequence.wrapping_sub(next);
+        let late = next.wrapping_sub(sequence);
+        let is_late = (1..=MOST_LATE).contains(&late);
+        let changes = Changes { layer, sequence, first, count, bytes: fields.bytes.to_vec() };
+        if is_whole {
+            if !is_late {
+                known.sequence = Some(sequence.wrapping_sub(1));
+            }
+            self.apply(&changes, |_| true);
+            let is_part = |segment: usize| (segment + segments - first) % segments < count;
+            let later: Vec<Changes> = self.kept.iter().filter(|kept| kept.is_after(&changes)).cloned().collect();
+            later.iter().for_each(|later| self.apply(later, is_part));
+        } else {
+            if is_late {
+                // A later state has arrived already.
+                return Ok(stamp);
+            }
+            known.missed += u64::from(ahead.min(1 << 16));
+            known.sequence = Some(sequence);
+            self.apply(&changes, |_| true);
+            self.keep(changes);
+        }
+        self.last = Some(stamp);
+        Ok(stamp)
+    }
+
+    /// Applies a message to those of its segments that `is_wanted` accepts.
+    fn apply(&mut self, message: &Changes, is_wanted: impl Fn(usize) -> bool) {
+        let (layer, segments) = (message.layer, self.tree.segments());
+        let mut decoder = RangeDecoder::new(&message.bytes);
         let mut model = Model::default();
-        for i in 0..count {
-            let segment = (first + i) % segments;
+        for i in 0..message.count {
+            let segment = (message.first + i) % segments;
             let is_refresh = model.code(&mut decoder, &self.tree, (layer, segment), false, &mut self.values);
+            if !is_wanted(segment) {
+                continue;
+            }
             let is_known = &mut self.layers[layer].is_known[segment];
             *is_known |= is_refresh;
             if !*is_known {
@@ -362,7 +505,15 @@ impl ColorDecoder {
                 add(&values[places.clone()], is_refresh, &mut state[places]);
             });
         }
-        Ok(stamp)
+    }
+
+    fn keep(&mut self, changes: Changes) {
+        self.kept_bytes += changes.bytes.len();
+        self.kept.push_back(changes);
+        while self.kept.len() > MAX_KEPT || self.kept_bytes > MAX_KEPT_BYTES {
+            let Some(oldest) = self.kept.pop_front() else { break };
+            self.kept_bytes -= oldest.bytes.len();
+        }
     }
 
     /// Follows an encoder that restarted. The colours of the previous one are shown until new ones arrive.
@@ -373,6 +524,8 @@ impl ColorDecoder {
             self.is_shown.fill(false);
         }
         (self.epoch, self.step) = (Some(epoch), step);
+        self.kept.clear();
+        self.kept_bytes = 0;
         for layer in &mut self.layers {
             layer.is_known.fill(false);
             layer.sequence = None;
@@ -407,5 +560,26 @@ impl ColorDecoder {
             let [r, g, b] = color_of(item).map(|code| srgb.linear(code));
             colors[i] = [r, g, b, 1.0];
         });
+    }
+}
+
+impl Changes {
+    /// Returns whether these changes follow a whole state of their layer.
+    fn is_after(&self, whole: &Self) -> bool {
+        self.layer == whole.layer && self.sequence.wrapping_sub(whole.sequence) <= MOST_LATE
+    }
+}
+
+impl WholeColors for ColorDecoder {
+    fn whole(&self, first_layer: usize) -> Vec<(usize, Vec<u8>)> {
+        let (Some(stamp), Some(epoch)) = (self.last, self.epoch) else { return Vec::new() };
+        let state = State { stamp, epoch, step: self.step, tree: &self.tree, levels: &self.state };
+        let mut messages = Vec::new();
+        for (layer, known) in self.layers.iter().enumerate().skip(first_layer) {
+            let next = known.sequence.map_or(0, |last| last.wrapping_add(1));
+            let is_known = |segment: usize| known.is_known[segment];
+            messages.extend(state.encode_layer(layer, next, is_known).into_iter().map(|bytes| (layer, bytes)));
+        }
+        messages
     }
 }

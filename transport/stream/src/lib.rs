@@ -6,6 +6,7 @@
 //! | [`Motion`] | pose, translations of the deformation graph's nodes | every frame, decodable by itself |
 //! | template with axes and colours ([`AvatarSource`]) | avatar, moved by its pose alone | once per viewer; then no colours |
 //! | colours, in [`LAYERS`] layers | changes since the previous message, from coarse to fine | every frame |
+//! | [`WholeColors::whole`] | present state of the colours, by layer | for a viewer that joins, or missed changes |
 //! | [`SplatState`] | all Gaussians in the world, without skinning | every frame, decodable by itself |
 //!
 //! Viewers pose the Gaussians themselves ([`StreamTemplate::pose`]): FlyHuman Eq. 2 is linear in the node translations, and a pose is a few
@@ -94,7 +95,7 @@ mod tree;
 
 pub use attributes::LIGHT_TERMS;
 pub use avatar::{AvatarGaussian, AvatarSource, PosedAxes};
-pub use colors::{ColorDecoder, ColorEncoder, ColorSettings, LAYERS};
+pub use colors::{ColorDecoder, ColorEncoder, ColorSettings, LAYERS, WholeColors};
 pub use error::StreamError;
 pub use message::{CODEC_VERSION, MAX_MESSAGE_BYTES};
 pub use motion::{Motion, MotionEncoder};

@@ -83,10 +83,7 @@ fn codec() -> Result<(), SplatError> {
 }
 
 fn measure(load: Load, seconds: f64) -> Result<(), Failure> {
-    let config = TransportConfig {
-        listen: vec!["tcp/127.0.0.1:0".to_owned()],
-        ..TransportConfig::publisher("bench")
-    };
+    let config = TransportConfig { listen: vec!["tcp/127.0.0.1:0".to_owned()], ..TransportConfig::publisher("bench") };
     let publisher = Publisher::open(&config)?;
     let mut child = Command::new(std::env::current_exe()?)
         .args(["watch", &publisher.endpoints()[0], &seconds.to_string()])
@@ -150,8 +147,7 @@ fn measure(load: Load, seconds: f64) -> Result<(), Failure> {
 
 /// Receives in the second process for a while and prints the figures of all topics together.
 fn watch(endpoint: &str, seconds: Duration) -> Result<(), Failure> {
-    let config =
-        TransportConfig { connect: vec![endpoint.to_owned()], ..TransportConfig::subscriber("bench") };
+    let config = TransportConfig { connect: vec![endpoint.to_owned()], ..TransportConfig::subscriber("bench") };
     let subscriber = Subscriber::open(&config, &Interests { views: Views::All, splats: true, ..Interests::default() })?;
     let mut millis = Vec::new();
     let mut first = None;

@@ -1,7 +1,7 @@
 //! Received messages that wait for their reader: one slot per topic, the newest message wins, bounded in bytes over all topics.
 
 use std::{
-    collections::{BTreeMap, VecDeque},
+    collections::{BTreeMap, BTreeSet, VecDeque},
     ops::Bound,
     sync::{Condvar, Mutex, MutexGuard},
     time::{Duration, Instant},
@@ -30,6 +30,9 @@ const MAX_TOPICS: usize = 256;
 /// Largest number of errors that wait to be reported; later ones are only counted.
 const MAX_ERRORS: usize = 16;
 
+/// Largest number of bytes of fetched messages that wait; the oldest are dropped.
+const MAX_FETCHED_BYTES: usize = 16 << 20;
+
 /// Received message, not yet decoded.
 #[derive(Debug)]
 pub(crate) struct Raw {
@@ -52,6 +55,10 @@ struct Slot {
 #[derive(Debug, Default)]
 struct State {
     slots: BTreeMap<String, Slot>,
+    /// Messages of the person stream that were fetched, in order.
+    fetched: VecDeque<(String, Raw)>,
+    /// People of whom changes of colours were missed.
+    missed_colors: BTreeSet<u32>,
     /// Number of messages received over all topics.
     arrivals: u64,
     /// Payload bytes in all slots.
@@ -197,6 +204,33 @@ impl Inbox {
         lock(&self.color_layers).has_begun()
     }
 
+    /// Returns whether so few frame sets come that a refresh of the colours would take long.
+    pub(crate) fn is_rig_slow(&self) -> bool {
+        lock(&self.color_layers).is_rig_slow()
+    }
+
+    /// Returns whether the line carries fewer than all layers of colours.
+    pub(crate) fn is_line_slow(&self) -> bool {
+        lock(&self.color_layers).is_line_slow()
+    }
+
+    /// Takes the people of whom changes of colours were missed.
+    pub(crate) fn take_missed_colors(&self) -> BTreeSet<u32> {
+        std::mem::take(&mut lock(&self.state).missed_colors)
+    }
+
+    /// Hands a fetched message of the person stream to the reader.
+    pub(crate) fn hand_over(&self, label: String, raw: Raw) {
+        let mut state = lock(&self.state);
+        state.fetched.push_back((label, raw));
+        let size = |fetched: &VecDeque<(String, Raw)>| fetched.iter().map(|(_, raw)| raw.payload.len()).sum::<usize>();
+        while size(&state.fetched) > MAX_FETCHED_BYTES {
+            state.fetched.pop_front();
+        }
+        drop(state);
+        self.changed.notify_all();
+    }
+
     /// Begins to subscribe to colours.
     pub(crate) fn begin_colors(&self) {
         lock(&self.color_layers).begin();
@@ -261,6 +295,13 @@ impl Inbox {
         let observed = Observed { now: now.instant, clock, latency_nanos: steady.unwrap_or(by_wall), missed };
         self.observe_line(label, header.kind, payload.len(), observed);
         slot.raw = waits.then_some(Raw { header, payload, latency_nanos, exact });
+        // A reader that is too slow misses the replaced changes as well.
+        if let Some((person, Some(_))) = keys::person_in(label).filter(|_| missed > 0 || is_replaced) {
+            state.missed_colors.insert(person);
+            while state.missed_colors.len() > MAX_PERSON_TOPICS {
+                state.missed_colors.pop_first();
+            }
+        }
         drop(state);
         self.changed.notify_all();
         Ok(())
@@ -335,6 +376,9 @@ impl Inbox {
         wanted: impl Fn(&str) -> bool,
     ) -> Result<Option<(String, Raw)>, TransportError> {
         self.wait(timeout, |state| {
+            if let Some(at) = state.fetched.iter().position(|(label, _)| wanted(label)) {
+                return state.fetched.remove(at);
+            }
             let ready = |(label, slot): (&String, &Slot)| (wanted(label) && slot.raw.is_some()).then(|| label.clone());
             let after = (Bound::Excluded(state.served.as_str()), Bound::Unbounded);
             let label =

@@ -90,6 +90,21 @@ pub(crate) fn chunk_in(label: &str) -> Option<(u64, u32)> {
     Some((u64::from_str_radix(hash, 16).ok()?, chunk.parse().ok()?))
 }
 
+/// Label under which the last motions of all people are queried.
+pub(crate) const LAST_MOTIONS: &str = "present/motions";
+
+/// Returns the label under which the hash of the present colours of a person is queried, from a layer on.
+pub(crate) fn whole_colors_label(person: u32, first_layer: usize) -> String {
+    format!("present/colors-{person}-{first_layer}")
+}
+
+/// Returns person and first layer of such a label.
+pub(crate) fn whole_colors_in(label: &str) -> Option<(u32, usize)> {
+    let (person, layer) = label.strip_prefix("present/colors-")?.split_once('-')?;
+    let layer = layer.parse().ok().filter(|layer| *layer < flyrig_stream::LAYERS)?;
+    Some((person.parse().ok()?, layer))
+}
+
 /// Returns whether a label is that of splats.
 pub(crate) fn is_splats(label: &str) -> bool {
     label == "splats" || label.starts_with(PERSON_SPLATS)
@@ -175,6 +190,8 @@ mod tests {
         assert_eq!(person_in(&color_label(0, 2)), Some((0, Some(2))));
         assert_eq!(chunk_in(&chunk_label(u64::MAX - 3, 12)), Some((u64::MAX - 3, 12)));
         assert_eq!(chunk_in("template/zz-1"), None);
+        assert_eq!(whole_colors_in(&whole_colors_label(7, 2)), Some((7, 2)));
+        assert_eq!((whole_colors_in("present/colors-7-3"), whole_colors_in("present/motions")), (None, None));
         for bad in
             ["person/07/motion", "person/x/motion", "person/1/color-3", "person/1", "person/1/motion/x", "splats"]
         {

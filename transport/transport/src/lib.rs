@@ -77,6 +77,7 @@ pub use header::{HEADER_BYTES, Header, MessageKind};
 pub use keys::MAX_PERSON_TOPICS;
 pub use people::{
     person_stream::PersonMessage,
+    present::SharedColors,
     relay::Relay,
     template_fetcher::{FetchedTemplate, TemplateFetcher},
 };

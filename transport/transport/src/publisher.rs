@@ -20,7 +20,10 @@ use crate::{
     header::{Header, MessageKind, empty_header},
     json::{MAX_JSON_BYTES, from_json, to_json},
     keys::{self, MAX_PERSON_TOPICS, VIEWER_PREFIX},
-    people::person_stream::{PersonMessage, PublishedPeople, answer_templates},
+    people::{
+        person_stream::{PersonMessage, PublishedPeople, answer_templates},
+        present::SharedColors,
+    },
     printable::printable,
     session::{
         config::{LARGEST_QUESTION, Side, TransportConfig},
@@ -127,12 +130,16 @@ impl Publisher {
             .background()
             .wait()
             .map_err(failed)?;
-        session
-            .declare_queryable(keys::key(rig, "template/*"))
-            .callback(answer_templates(people.clone())?)
-            .background()
-            .wait()
-            .map_err(failed)?;
+        let answer = Arc::new(answer_templates(people.clone())?);
+        for label in ["template/*", "present/*"] {
+            let answer = Arc::clone(&answer);
+            session
+                .declare_queryable(keys::key(rig, label))
+                .callback(move |query| answer(query))
+                .background()
+                .wait()
+                .map_err(failed)?;
+        }
         let alive = keys::key(rig, &format!("alive/{}", session.zid()));
         let alive = session.liveliness().declare_token(alive).wait().map_err(failed)?;
 
@@ -207,8 +214,18 @@ impl Publisher {
         self.people.is_watched()
     }
 
-    /// Keeps the template of a person for viewers that query it; those of the last [`MAX_PERSON_TOPICS`] + 1 people are kept.
+    /// Keeps the template of a person for viewers that query it; those of the last [`MAX_PERSON_TOPICS`] + 1 people are kept. Viewers that
+    /// join get the present colours, which are decoded from those that are published: give their encoder instead where there is one
+    /// ([`Self::offer_template_with`]).
     pub fn offer_template(&self, person: u32, hash: u64, bytes: Bytes) {
+        self.people.present.decode_colors(person, &bytes);
+        self.people.offer_template(person, hash, bytes);
+    }
+
+    /// Keeps the template of a person, as [`Self::offer_template`] does, and the encoder of the colours for viewers that join. The encoder
+    /// is locked while its state is encoded.
+    pub fn offer_template_with(&self, person: u32, hash: u64, bytes: Bytes, colors: SharedColors) {
+        self.people.present.set_colors(person, colors);
         self.people.offer_template(person, hash, bytes);
     }
 
@@ -226,6 +243,7 @@ impl Publisher {
 
     fn offer_person(&self, person: u32, layer: Option<usize>, bytes: Bytes, header: Header) -> PublishOutcome {
         let topics = self.people.topics(person, &self.shared);
+        self.people.present.published(person, layer, &bytes, Instant::now());
         topics
             .get(layer.map_or(0, |layer| layer + 1))
             .map_or(PublishOutcome::Unwatched, |topic| self.offer(topic, Body::Bytes(bytes), header))

@@ -126,6 +126,10 @@ pub struct RigStats {
     /// Tracking quality of each person.
     #[serde(default)]
     pub subjects: Vec<SubjectStats>,
+    /// Time for which a person has been seen who is not among `subjects` yet, because the shape is being measured, seconds; `None` while
+    /// there is no such person, and from older programs.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub measuring_secs: Option<f64>,
 }
 
 impl RigStats {
@@ -140,6 +144,7 @@ impl RigStats {
         };
         let finite = [self.uptime_secs, self.frames_per_second]
             .into_iter()
+            .chain(self.measuring_secs)
             .chain(self.stages.iter().flat_map(|stage| [stage.mean_millis, stage.p95_millis]))
             .chain(self.views.iter().flat_map(|view| [view.per_second, view.bytes_per_second]))
             .all(f64::is_finite);

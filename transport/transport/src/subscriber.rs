@@ -142,12 +142,22 @@ impl Subscriber {
                 .map_err(failed)?;
         }
         let watcher = inbox.clone();
+        let people = Arc::new(PersonSubscription::new(&session, rig, &inbox));
+        // The session keeps the callback, and the people the session.
+        let to_people = Arc::downgrade(&people);
+        if interests.people {
+            people.begin_motion()?;
+        }
         session
             .liveliness()
             .declare_subscriber(keys::any_version_alive(rig))
             .history(true)
             .callback(move |sample| {
-                watcher.publisher_alive(sample.key_expr().as_str(), sample.kind() == SampleKind::Put);
+                let is_alive = sample.kind() == SampleKind::Put;
+                watcher.publisher_alive(sample.key_expr().as_str(), is_alive);
+                if let Some(people) = to_people.upgrade().filter(|_| is_alive) {
+                    people.rig_appeared();
+                }
             })
             .background()
             .wait()
@@ -158,10 +168,6 @@ impl Subscriber {
         let renewal = Renewal::start(session.clone(), key, format!("{VIEWER_PREFIX}{id}"))?;
         let connected = inbox.clone();
         let probe = opening::probe(config, move || connected.publishers() > 0)?;
-        let people = Arc::new(PersonSubscription::new(&session, rig, &inbox));
-        if interests.people {
-            people.begin_motion()?;
-        }
         Ok(Self { inbox, people, id, renewal, probe, session, closed: false, _alive: alive })
     }
 
@@ -200,7 +206,8 @@ impl Subscriber {
     }
 
     /// Takes the next waiting message of the person stream, topics in turns; `None` after the timeout. Call it often: only the newest
-    /// message of a topic waits. It also adapts the number of colour layers, see [`Self::color_layers`].
+    /// message of a topic waits. What was published before comes like other messages: the last motions once the rig appears, and the
+    /// present colours of a person whose template [`TemplateFetcher::take`] returned. It also adapts the number of colour layers, see [`Self::color_layers`].
     ///
     /// # Errors
     /// As [`Self::next_view`].
@@ -218,6 +225,12 @@ impl Subscriber {
     /// `Malformed` when the answer is not that template, `Session` when the query cannot be sent.
     pub fn template(&self, hash: u64, timeout: Duration) -> Result<Option<Vec<u8>>, TransportError> {
         self.people.ask_template(hash, timeout)
+    }
+
+    /// Fetches the present colours of a person whose template [`Self::template`] returned; they come through [`Self::next_person`]. Never
+    /// waits.
+    pub fn fetch_colors(&self, person: u32) {
+        self.people.template_taken(&[person]);
     }
 
     /// Starts a fetcher of templates, which works in parallel to this subscriber.
@@ -272,6 +285,12 @@ impl Subscriber {
     #[must_use]
     pub fn color_layers(&self) -> usize {
         self.inbox.color_layers()
+    }
+
+    /// Returns whether the line is why fewer than all layers are subscribed to: motion came late or was lost, or a template took too long.
+    #[must_use]
+    pub fn is_line_slow(&self) -> bool {
+        self.inbox.is_line_slow()
     }
 
     /// Returns the number of live publishers of this rig with the same schema version.

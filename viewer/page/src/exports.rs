@@ -10,6 +10,7 @@ struct State {
     page: Page,
     input: Vec<u8>,
     error: String,
+    floor: [f32; 12],
     moved: bool,
     recolored: bool,
 }
@@ -188,6 +189,51 @@ pub extern "C" fn jump(camera: usize) {
 #[unsafe(no_mangle)]
 pub extern "C" fn people() -> u32 {
     with(|state| state.page.people_shown() as u32 | u32::from(state.page.is_complete()) << 8)
+}
+
+/// Calls [`Page::choose`].
+#[unsafe(no_mangle)]
+pub extern "C" fn choose(person: u32) {
+    with(|state| state.page.choose(person));
+}
+
+/// Calls [`Page::reset`].
+#[unsafe(no_mangle)]
+pub extern "C" fn reset() {
+    with(|state| state.page.reset());
+}
+
+/// Returns [`Page::person`]; -1 beyond the people shown.
+#[unsafe(no_mangle)]
+pub extern "C" fn person(index: usize) -> f64 {
+    with(|state| state.page.person(index).map_or(-1.0, f64::from))
+}
+
+/// Returns [`Page::capture_secs`].
+#[unsafe(no_mangle)]
+pub extern "C" fn capture_secs() -> f64 {
+    with(|state| state.page.capture_secs())
+}
+
+/// Returns the address of [`flyrig_viewing::Floor::numbers`], 12 floats; their radius is 0 before the rig is known.
+#[unsafe(no_mangle)]
+pub extern "C" fn floor() -> *const f32 {
+    with(|state| {
+        state.floor = state.page.floor().map_or([0.0; 12], flyrig_viewing::Floor::numbers);
+        state.floor.as_ptr()
+    })
+}
+
+/// Returns the address of [`flyrig_viewing::Floor::shadow`], [`shadow_side`] squared bytes; 0 before the rig is known.
+#[unsafe(no_mangle)]
+pub extern "C" fn shadow() -> *const u8 {
+    with(|state| state.page.floor().map_or(std::ptr::null(), |floor| floor.shadow().as_ptr()))
+}
+
+/// Returns [`flyrig_viewing::SHADOW_SIDE`].
+#[unsafe(no_mangle)]
+pub extern "C" fn shadow_side() -> usize {
+    flyrig_viewing::SHADOW_SIDE
 }
 
 /// Returns [`Page::frame`].

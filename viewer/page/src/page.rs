@@ -4,7 +4,7 @@ use std::{fmt, sync::Arc};
 
 use flyrig_stream::{Posed, PosedAxes, StreamError, StreamTemplate};
 use flyrig_types::{Camera, Rig};
-use flyrig_viewing::{Ellipsoids, Ingested, Navigation, People};
+use flyrig_viewing::{Ellipsoids, Floor, Ingested, Navigation, People};
 use glam::DVec3;
 
 use crate::order::DrawOrder;
@@ -59,7 +59,10 @@ pub struct Page {
     people: People,
     rig: Option<Rig>,
     navigation: Option<Navigation>,
+    floor: Option<Floor>,
     follows: bool,
+    /// Person to follow; the first shown where there is none of this number.
+    chosen: Option<u32>,
     centers: Vec<[f32; 4]>,
     normals: Vec<[f32; 4]>,
     colors: Vec<[f32; 4]>,
@@ -67,8 +70,12 @@ pub struct Page {
     shown: Vec<(u32, u64, u64)>,
     /// Whether a person has a new template, or was forgotten.
     is_stale: bool,
+    /// Root of each person shown, metres, world.
+    places: Vec<DVec3>,
     /// Frame number of the first person's motion on the rig.
     frame: u64,
+    /// Capture time of the newest motion shown, seconds of the rig's clock.
+    capture_secs: f64,
     posed: Posed,
     axes: PosedAxes,
     /// Shapes of the Gaussians; empty without an avatar.
@@ -104,7 +111,10 @@ impl Page {
         rig.validate().map_err(|error| PageError::Rig(error.to_string()))?;
         if self.rig.as_ref() != Some(&rig) {
             self.navigation = Some(Navigation::new(&rig));
+            self.floor = Some(Floor::new(&rig));
             self.rig = Some(rig);
+            // The people who came before it stand on its floor.
+            self.is_stale = true;
         }
         Ok(())
     }
@@ -113,6 +123,9 @@ impl Page {
     pub fn forget_people(&mut self) {
         self.people.clear();
         self.is_stale = true;
+        if let Some(floor) = &mut self.floor {
+            floor.clear();
+        }
     }
 
     /// Poses all people as shown at `now`. Returns whether centres, and whether colours, have changed.
@@ -128,11 +141,16 @@ impl Page {
             }
         }
         let shown: Vec<(u32, u64, u64)> = motions.iter().map(|(key, _)| *key).collect();
+        self.places.clear();
+        self.places.extend(motions.iter().map(|(_, motion)| DVec3::from(motion.root_translation.map(f64::from))));
+        let chosen = shown.iter().position(|(number, ..)| Some(*number) == self.chosen).unwrap_or(0);
         if self.follows
-            && let (Some(navigation), Some((_, motion))) = (&mut self.navigation, motions.first())
+            && let (Some(navigation), Some(place)) = (&mut self.navigation, self.places.get(chosen))
         {
-            navigation.follow(Some(DVec3::from(motion.root_translation.map(f64::from))));
+            navigation.follow(Some(*place));
         }
+        let newest = motions.iter().map(|(_, motion)| motion.stamp.capture_nanos).max();
+        self.capture_secs = newest.map_or(0.0, |nanos| nanos as f64 / 1e9);
         let is_stale = std::mem::take(&mut self.is_stale);
         if shown == self.shown && !is_stale {
             return (false, false);
@@ -162,6 +180,9 @@ impl Page {
                 let axes = person.pose_axes(motion, &mut self.axes).then_some(&self.axes);
                 self.ellipsoids.push(&self.posed.center_scale[..count], &colors[..count], axes);
             }
+        }
+        if let Some(floor) = self.floor.as_mut().filter(|_| moved && !self.centers.is_empty()) {
+            floor.update(&self.centers);
         }
         self.frame = motions.first().map_or(0, |(_, motion)| motion.stamp.frame);
         self.shown = shown;
@@ -235,12 +256,46 @@ impl Page {
         self.ellipsoids.rotations()
     }
 
+    /// Returns the floor, once the rig is known.
+    #[must_use]
+    pub fn floor(&self) -> Option<&Floor> {
+        self.floor.as_ref()
+    }
+
+    /// Returns the capture time of the newest motion shown, seconds of the rig's clock; 0 without people.
+    #[must_use]
+    pub fn capture_secs(&self) -> f64 {
+        self.capture_secs
+    }
+
+    /// Returns the number of the person that is shown as the `index`th; `None` beyond them.
+    #[must_use]
+    pub fn person(&self, index: usize) -> Option<u32> {
+        self.shown.get(index).map(|(number, ..)| *number)
+    }
+
+    /// Turns the view to a person, who is followed where [`Self::set_follows`] says so; a person who is not shown changes nothing.
+    pub fn choose(&mut self, person: u32) {
+        let index = self.shown.iter().position(|(number, ..)| *number == person);
+        if let (Some(place), Some(navigation)) = (index.and_then(|index| self.places.get(index)), &mut self.navigation)
+        {
+            self.chosen = Some(person);
+            navigation.look_at(*place);
+        }
+    }
+
+    /// Returns to the viewpoint of the start.
+    pub fn reset(&mut self) {
+        self.navigation = self.rig.as_ref().map(Navigation::new);
+        self.chosen = None;
+    }
+
     /// Returns the viewpoint, once the rig is known.
     pub fn navigation(&mut self) -> Option<&mut Navigation> {
         self.navigation.as_mut()
     }
 
-    /// Sets whether the viewpoint moves along with the first person.
+    /// Sets whether the viewpoint moves along with the chosen person, or the first.
     pub fn set_follows(&mut self, follows: bool) {
         self.follows = follows;
         if !follows && let Some(navigation) = &mut self.navigation {

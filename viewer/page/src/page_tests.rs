@@ -79,6 +79,7 @@ fn a_person_is_shown_once_template_motion_and_rig_are_there() {
     assert!(page.order(640, 480).is_empty(), "without a rig there is no viewpoint");
     page.ingest(PageMessageKind::Rig, 0, &serde_json::to_vec(&rig()).unwrap(), 0.0).unwrap();
     assert_eq!(page.order(640, 480).len(), GAUSSIANS);
+    assert!(page.pose(0.0, false).0 && page.floor().is_some_and(|floor| floor.numbers()[3] > 0.0));
 
     let mut colors = ColorEncoder::new(&encoded, ColorSettings::default(), 7);
     for layer in &colors.encode(Stamp::default(), &[[0.5, 0.2, 0.1, 1.0]; GAUSSIANS]) {
@@ -137,6 +138,37 @@ fn following_moves_the_viewpoint_with_the_person() {
     page.set_follows(false);
     let left = place(&mut page, 3, 1.4);
     assert!((left - after).length() > 0.3);
+}
+
+#[test]
+fn a_person_is_chosen_and_the_start_comes_back() {
+    let (mut page, encoded) = (page(), template(0.5));
+    let start = page.look(64, 64).unwrap();
+    for (person, x) in [(3, 0.0), (8, 1.5)] {
+        page.ingest(PageMessageKind::Template, person, &encoded.bytes, 0.0).unwrap();
+        page.ingest(PageMessageKind::Motion, person, &motion(&encoded, 4, x), 0.0).unwrap();
+    }
+    assert!(page.capture_secs() <= 0.0 && page.person(0).is_none());
+    page.pose(0.0, false);
+    assert_eq!([0, 1, 2].map(|index| page.person(index)), [Some(3), Some(8), None]);
+    assert!((page.capture_secs() - 0.4).abs() < 1e-9);
+    // A person who is not there changes nothing.
+    page.choose(5);
+    assert_eq!(page.look(64, 64).unwrap(), start);
+    page.choose(8);
+    let place = |page: &mut Page, x: f64| page.look(64, 64).unwrap().project(DVec3::new(x, 0.0, 1.0)).unwrap();
+    assert!(place(&mut page, 1.5).distance(glam::DVec2::splat(31.5)) < 0.1);
+    // That person is followed.
+    page.set_follows(true);
+    page.pose(0.0, false);
+    for (person, x) in [(3, 0.4), (8, 1.9)] {
+        page.ingest(PageMessageKind::Motion, person, &motion(&encoded, 5, x), 0.1).unwrap();
+    }
+    page.pose(0.1, false);
+    assert!(place(&mut page, 1.9).distance(glam::DVec2::splat(31.5)) < 0.1);
+    page.set_follows(false);
+    page.reset();
+    assert_eq!(page.look(64, 64).unwrap(), start);
 }
 
 #[test]

@@ -146,6 +146,15 @@ fn the_shipped_module_decodes_poses_and_sorts_as_this_crate_does() {
         }
     }
     assert_eq!(shipped.call::<_, u32>("people", ()), 1 | 256);
+    let (floor, shadow, side): (u32, u32, u32) =
+        (shipped.call("floor", ()), shipped.call("shadow", ()), shipped.call("shadow_side", ()));
+    assert!(shadow > 0 && side as usize == flyrig_viewing::SHADOW_SIDE);
+    let numbers = shipped.read::<Bits>(floor, 12);
+    for (ours, shipped) in ours.floor().unwrap().numbers().iter().zip(numbers) {
+        assert!((ours - f32::from_bits(shipped.0)).abs() < 1e-4);
+    }
+    assert!((shipped.call::<_, f64>("capture_secs", ()) - ours.capture_secs()).abs() < 1e-9);
+    assert_eq!((shipped.call::<_, f64>("person", 0u32), shipped.call::<_, f64>("person", 1u32)), (1.0, -1.0));
     assert_eq!((shipped.call::<_, u32>("rotations", ()), shipped.call::<_, u32>("scales", ())), (0, 0));
 
     // An avatar beside the same person.

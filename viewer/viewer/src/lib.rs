@@ -24,4 +24,4 @@ mod window;
 pub use receiver::{Receiver, ReceiverState, age_secs, clock_secs};
 pub use scene::PeopleScene;
 pub use shown_person::ShownPerson;
-pub use window::{Screenshot, ViewOptions, ViewerError, open_window};
+pub use window::{Screenshot, ViewOptions, ViewerError, check_desktop, open_window};

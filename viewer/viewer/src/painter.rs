@@ -8,8 +8,8 @@ use std::{
 use flyrig_gpu::GpuContext;
 use flyrig_renderer::composite_over;
 use flyrig_stream::{Posed, PosedAxes, Stamp};
-use flyrig_types::{Camera, SupervisedThread, ThreadHealth, lock, wait};
-use flyrig_viewing::StreamPerson;
+use flyrig_types::{Camera, Rig, SupervisedThread, ThreadHealth, lock, wait};
+use flyrig_viewing::{Floor, StreamPerson};
 use glam::DVec3;
 
 use crate::{
@@ -80,9 +80,9 @@ impl Painter {
         let (of_thread, gpu) = (Arc::clone(&shared), gpu.clone());
         let adapter = gpu.adapter_name();
         let work = move || {
-            let (mut scene, mut posed, mut last) = (None, Vec::new(), None);
+            let (mut stage, mut posed, mut last) = (Stage::default(), Vec::new(), None);
             while let Some(request) = of_thread.next() {
-                let drawn = draw(&gpu, &mut scene, &mut posed, &receiver, &request, &mut last);
+                let drawn = draw(&gpu, &mut stage, &mut posed, &receiver, &request, &mut last);
                 let mut state = of_thread.lock();
                 match drawn {
                     Ok(None) => continue,
@@ -148,6 +148,13 @@ impl Shared {
 /// Content of a view: the request, and the number, stamp and colour count of each person. Equal content need not be drawn again.
 type Content = (Request, Vec<(u32, Stamp, u64)>);
 
+/// What is drawn into: the people, and the floor of the rig under them.
+#[derive(Debug, Default)]
+struct Stage {
+    scene: Option<PeopleScene>,
+    floor: Option<(Rig, Floor)>,
+}
+
 /// Posed person; memory is kept from one view to the next.
 #[derive(Debug, Default)]
 struct PosedPerson {
@@ -161,7 +168,7 @@ struct PosedPerson {
 /// Draws a view, unless it would equal the `last` one.
 fn draw(
     gpu: &GpuContext,
-    scene: &mut Option<PeopleScene>,
+    Stage { scene, floor }: &mut Stage,
     posed: &mut Vec<PosedPerson>,
     receiver: &Receiver,
     request: &Request,
@@ -183,6 +190,10 @@ fn draw(
             return Ok(None);
         }
         *last = Some(content);
+        let known = floor.as_ref().map(|(rig, _)| rig);
+        if let Some(rig) = state.rig.as_ref().filter(|rig| known != Some(*rig)) {
+            *floor = Some((rig.clone(), Floor::new(rig)));
+        }
         for (number, motion) in motions {
             let Some(person) = state.people.get_mut(number) else { continue };
             if posed.len() <= shown {
@@ -207,7 +218,15 @@ fn draw(
         axes: is_avatar.then_some(axes),
     }))?;
     let view = scene.draw(&request.camera)?;
-    let backdrop = vec![BACKDROP; view.width as usize * view.height as usize * 3];
+    let backdrop = match floor {
+        Some((_, floor)) if shown > 0 => {
+            let centers: Vec<[f32; 4]> =
+                posed[..shown].iter().flat_map(|person| person.posed.center_scale.iter().copied()).collect();
+            floor.update(&centers);
+            floor.backdrop(&request.camera, BACKDROP)
+        }
+        _ => vec![BACKDROP; view.width as usize * view.height as usize * 3],
+    };
     Ok(Some(PaintedView {
         width: view.width,
         height: view.height,

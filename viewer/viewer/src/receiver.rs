@@ -33,6 +33,8 @@ pub struct ReceiverState {
     pub rig: Option<Rig>,
     /// Statistics of the rig, updated about every second.
     pub stats: Option<RigStats>,
+    /// Arrival of the statistics.
+    pub stats_at: Option<Instant>,
     /// Time and text of the last problem.
     pub problem: Option<(Instant, String)>,
     /// Number of live publishers of this rig.
@@ -41,6 +43,8 @@ pub struct ReceiverState {
     pub refusal: Option<String>,
     /// Number of subscribed colour layers, from the coarsest.
     pub color_layers: usize,
+    /// Whether the line to the rig is why layers are missing.
+    pub is_line_slow: bool,
     /// Age of the newest motion at its arrival, seconds, and whether it is exact because both ends run on one host.
     pub age: Option<(f64, bool)>,
     /// Arrival and bytes of the last messages, and whether each was a motion.
@@ -68,10 +72,19 @@ impl ReceiverState {
         if self.rig.is_none() {
             return Some("Waiting for the rig's calibration".to_owned());
         }
-        if self.people.is_empty() {
-            return Some("The rig is running; no person has been seen yet".to_owned());
+        self.people.is_empty().then(|| self.absence())
+    }
+
+    /// Explains why nobody is shown while the rig is up.
+    #[must_use]
+    pub fn absence(&self) -> String {
+        let Some(stats) = &self.stats else { return "Asking the rig".to_owned() };
+        if let Some(secs) = stats.measuring_secs {
+            let since = self.stats_at.map_or(0.0, |at| at.elapsed().as_secs_f64());
+            return format!("Somebody is being measured ({:.0} s)", secs + since);
         }
-        None
+        let is_seen = stats.subjects.iter().any(|subject| !matches!(subject.state.as_str(), "lost" | "searching"));
+        (if is_seen { "Somebody is seen, and is on the way here" } else { "Nobody is seen" }).to_owned()
     }
 
     /// Returns the age of a capture time, seconds; `None` where no clock of this host is known for it.
@@ -201,11 +214,12 @@ impl Link<'_> {
         state.publishers = self.subscriber.publishers();
         state.refusal = self.subscriber.trouble();
         state.color_layers = self.subscriber.color_layers();
+        state.is_line_slow = self.subscriber.is_line_slow();
         for error in [stats.as_ref().err(), rig.as_ref().err()].into_iter().flatten() {
             state.complain(error.to_string());
         }
         if let Ok(Some(stats)) = stats {
-            state.stats = Some(stats.body);
+            (state.stats, state.stats_at) = (Some(stats.body), Some(Instant::now()));
         }
         if let Ok(Some(rig)) = rig {
             state.rig = Some(rig);
@@ -260,6 +274,26 @@ pub fn age_secs(capture_nanos: i64, offset_nanos: Option<i64>) -> Option<f64> {
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    #[test]
+    fn the_reason_why_nobody_is_shown_is_true() {
+        let mut state = ReceiverState::default();
+        assert!(state.trouble("studio", "tcp/rig:7447").unwrap().starts_with("No rig 'studio' at tcp/rig:7447 yet"));
+        state.publishers = 1;
+        assert_eq!(state.trouble("studio", "").unwrap(), "Waiting for the rig's calibration");
+        state.rig = Some(Rig { cameras: Vec::new(), world_up: glam::DVec3::Z });
+        assert_eq!(state.trouble("studio", "").unwrap(), "Asking the rig");
+        let subject = |state: &str| flyrig_transport::SubjectStats { state: state.to_owned(), ..Default::default() };
+        for (measuring_secs, subjects, expected) in [
+            (None, vec![], "Nobody is seen"),
+            (None, vec![subject("lost"), subject("searching")], "Nobody is seen"),
+            (None, vec![subject("lost"), subject("first")], "Somebody is seen, and is on the way here"),
+            (Some(12.2), vec![], "Somebody is being measured (12 s)"),
+        ] {
+            state.stats = Some(RigStats { measuring_secs, subjects, ..RigStats::default() });
+            assert_eq!(state.trouble("studio", "").unwrap(), expected);
+        }
+    }
 
     #[test]
     fn ages_are_of_the_clock_that_is_possible() {

@@ -44,7 +44,9 @@ const CAMERA_KEYS: [egui::Key; 9] = [
     egui::Key::Num8,
     egui::Key::Num9,
 ];
-const HELP: &str = "drag: turn   right drag: shift   wheel: nearer   W A S D Q E: fly   1-9: camera   F: follow   R: start again   H: hide this";
+const HELP: &str = "drag: turn   right drag: shift   wheel: nearer   W A S D Q E: fly   1-9: camera   F: follow   R: start again   \
+                    F11: whole screen   H: hide this";
+const HINT: &str = "H: details and help";
 
 /// Options of the window.
 #[derive(Debug, Clone)]
@@ -59,8 +61,8 @@ pub struct ViewOptions {
     pub camera: Option<String>,
     /// Inner size of the window, points.
     pub size: [u32; 2],
-    /// Whether to return the window's content as soon as a person is shown with all colours, and to close it.
-    pub screenshot: bool,
+    /// Time after which the window's content is returned and the window closed, seconds; at once when a person is shown with all colours.
+    pub screenshot_within: Option<f64>,
     /// Time after which the window closes, seconds.
     pub seconds: Option<f64>,
 }
@@ -74,6 +76,8 @@ pub struct Screenshot {
     pub height: u32,
     /// sRGB bytes, row by row.
     pub rgb: Vec<u8>,
+    /// What is missing; `None` for a person with all colours.
+    pub missing: Option<String>,
 }
 
 /// Error of the window.
@@ -85,18 +89,26 @@ pub enum ViewerError {
     /// Error of the graphics device.
     #[error(transparent)]
     Gpu(#[from] GpuError),
+    /// Neither `DISPLAY` nor `WAYLAND_DISPLAY` is set.
+    #[error("no desktop here: use flyrig watch")]
+    NoDesktop,
     /// Failure to open a window.
-    #[error(
-        "cannot open a window: {0}. Run it in a desktop session (DISPLAY or WAYLAND_DISPLAY is set), or save images without a \
-         window: flyrig watch --out FOLDER"
-    )]
+    #[error("cannot open a window: {0}; save images without one: flyrig watch --out FOLDER")]
     Window(String),
     /// Failure to start a thread.
     #[error("cannot start a thread: {0}; end other programs, or raise the limit of processes (ulimit -u)")]
     Thread(#[from] std::io::Error),
-    /// Expiry of the time before there was anything to save.
-    #[error("no screenshot in {0:.0} s: {1}")]
-    NothingShown(f64, String),
+}
+
+/// Checks that this program can open a window.
+///
+/// # Errors
+/// [`ViewerError::NoDesktop`] on Unix without `DISPLAY` and `WAYLAND_DISPLAY`.
+pub fn check_desktop() -> Result<(), ViewerError> {
+    let is_set = |name: &str| std::env::var_os(name).is_some_and(|value| !value.is_empty());
+    let has_desktop =
+        !cfg!(target_os = "linux") || ["DISPLAY", "WAYLAND_DISPLAY", "WAYLAND_SOCKET"].iter().any(|name| is_set(name));
+    if has_desktop { Ok(()) } else { Err(ViewerError::NoDesktop) }
 }
 
 /// Opens the window and shows the rig's people until it is closed. Returns the screenshot where one is requested.
@@ -117,7 +129,6 @@ pub fn open_window(options: ViewOptions, gpu: &GpuContext) -> Result<Option<Scre
     let receiver = Arc::new(Receiver::start(&options.transport, wake.clone())?);
     let painter = Painter::start(gpu, Arc::clone(&receiver), wake)?;
     let shot: Arc<Mutex<Option<Screenshot>>> = Arc::default();
-    let limit = options.seconds;
     let (rig, endpoint) = (options.transport.rig.clone(), options.transport.connect.join(", "));
     let [width, height] = options.size.map(|side| side as f32);
     let native = eframe::NativeOptions {
@@ -127,13 +138,13 @@ pub fn open_window(options: ViewOptions, gpu: &GpuContext) -> Result<Option<Scre
             .with_min_inner_size([320.0, 240.0]),
         ..eframe::NativeOptions::default()
     };
-    let wants_shot = options.screenshot;
     let view = View {
         receiver: Arc::clone(&receiver),
         painter,
         navigation: None,
         follows: options.follow,
-        hides: false,
+        is_detailed: false,
+        is_full: false,
         on_processor: gpu.is_on_processor(),
         texture: None,
         shown: Shown::default(),
@@ -152,16 +163,18 @@ pub fn open_window(options: ViewOptions, gpu: &GpuContext) -> Result<Option<Scre
             Ok(Box::new(view))
         }),
     );
-    opened.map_err(|error| ViewerError::Window(error.to_string()))?;
-    let shot = lock(&shot).take();
-    if let (true, None, Some(limit)) = (wants_shot, &shot, limit) {
-        let trouble = receiver.state().trouble(&rig, &endpoint);
-        return Err(ViewerError::NothingShown(
-            limit,
-            trouble.unwrap_or_else(|| "the colours are incomplete".to_owned()),
-        ));
+    opened.map_err(|error| ViewerError::Window(in_plain_words(&error)))?;
+    Ok(lock(&shot).take())
+}
+
+/// Returns the error without places in the source of libraries.
+fn in_plain_words(error: &eframe::Error) -> String {
+    match error {
+        eframe::Error::Winit(_) | eframe::Error::WinitEventLoop(_) => {
+            "the desktop that DISPLAY or WAYLAND_DISPLAY names does not answer".to_owned()
+        }
+        error => error.to_string(),
     }
-    Ok(shot)
 }
 
 /// State of the screen.
@@ -186,7 +199,9 @@ struct View {
     /// Viewpoint; `None` until the rig's cameras are known.
     navigation: Option<Navigation>,
     follows: bool,
-    hides: bool,
+    /// Whether details and help are shown.
+    is_detailed: bool,
+    is_full: bool,
     on_processor: bool,
     texture: Option<egui::TextureHandle>,
     shown: Shown,
@@ -215,9 +230,7 @@ impl eframe::App for View {
             let whole = egui::Rect::from_min_max(egui::pos2(0.0, 0.0), egui::pos2(1.0, 1.0));
             painter.image(texture.id(), area, whole, egui::Color32::WHITE);
         }
-        if !self.hides {
-            self.write_over(&painter, area, now);
-        }
+        self.write_over(&painter, area, now);
         let is_over = self.options.seconds.is_some_and(|limit| self.started.elapsed().as_secs_f64() >= limit);
         self.take_shot(&context);
         let has_shot = lock(&self.shot).is_some();
@@ -256,7 +269,11 @@ impl View {
         let held = |key| f64::from(u8::from(context.input(|input| input.key_down(key))));
         let wheel = f64::from(context.input(|input| input.smooth_scroll_delta().y));
         self.follows ^= pressed(egui::Key::F);
-        self.hides ^= pressed(egui::Key::H);
+        self.is_detailed ^= pressed(egui::Key::H);
+        if pressed(egui::Key::F11) {
+            self.is_full ^= true;
+            context.send_viewport_cmd(egui::ViewportCommand::Fullscreen(self.is_full));
+        }
         if pressed(egui::Key::R) {
             self.navigation = None;
             self.start_navigation();
@@ -321,38 +338,16 @@ impl View {
 
     fn write_over(&self, painter: &egui::Painter, area: egui::Rect, now: Instant) {
         let state = self.receiver.state();
-        let (bytes, motions) = state.rates(now);
-        let shown = self.shown.changes.len() as f64 / RATE_OVER.as_secs_f64();
         let mut lines = Vec::new();
         if let Some(trouble) = state.trouble(&self.options.transport.rig, &self.endpoint) {
             lines.push((trouble, true));
+        } else if self.shown.people == 0 {
+            lines.push((state.absence(), true));
         } else {
-            let age = match (self.shown.age_secs, state.age) {
-                // The age grows until a new frame is drawn.
-                (Some(age), _) => {
-                    let since = self.shown.drawn_at.map_or(0.0, |at| now.duration_since(at).as_secs_f64());
-                    format!("age {:.0} ms", 1e3 * (age + since))
-                }
-                // By another host's clock, or a recording's, only the latency is known.
-                (None, Some((latency, _))) => format!("latency {:.0} ms", 1e3 * latency),
-                (None, None) => "age unknown".to_owned(),
-            };
-            lines.push((
-                format!(
-                    "{shown:.1} of {motions:.1} frames/s shown   {age}   {:.2} Mbit/s   drawn in {:.0} ms by {}",
-                    8e-6 * bytes,
-                    1e3 * self.shown.took.as_secs_f64(),
-                    self.painter.adapter
-                ),
-                false,
-            ));
-            lines.extend(people_lines(&state, self.shown.people));
-            // An avatar's colours are part of it.
-            let are_colors_sent = state.people.iter().any(|(_, person)| !person.template().is_avatar());
-            if are_colors_sent && state.color_layers < LAYERS {
-                let layers = state.color_layers;
-                lines.push((format!("colours: {layers} of {LAYERS} layers, as many as the network carries"), false));
-            }
+            lines.push((self.summary(&state, now), false));
+        }
+        if self.is_detailed {
+            lines.extend(self.details(&state, now).into_iter().map(|line| (line, false)));
         }
         if let Some((_, text)) = state.problem.as_ref().filter(|(at, _)| now.duration_since(*at) < SHOW_PROBLEM) {
             lines.push((text.clone(), true));
@@ -373,44 +368,76 @@ impl View {
             at.y += height + 3.0;
         }
         let faint = egui::Color32::from_gray(140);
-        let hint = if self.follows { format!("{HELP}   (following)") } else { HELP.to_owned() };
+        let help = if self.is_detailed { HELP } else { HINT };
+        let hint = if self.follows { format!("{help}   (following)") } else { help.to_owned() };
         let hint = painter.layout(hint, egui::FontId::proportional(12.0), faint, area.width() - 24.0);
         let bottom = area.left_bottom() + egui::vec2(12.0, -8.0 - hint.size().y);
         painter.galley(bottom, hint, faint);
     }
 
-    /// Requests a screenshot as soon as a person is shown with all colours.
+    /// Returns the plain line on what is shown.
+    fn summary(&self, state: &ReceiverState, now: Instant) -> String {
+        let age = self.shown.age_secs.map(|age| {
+            // The age grows until a new frame is drawn.
+            age + self.shown.drawn_at.map_or(0.0, |at| now.duration_since(at).as_secs_f64())
+        });
+        let mut line = age.map_or_else(|| "live".to_owned(), |age| format!("live, {age:.1} s behind"));
+        if !self.shown.is_complete {
+            line += ", colours are loading";
+        } else if state.is_line_slow && are_colors_sent(state) {
+            line += ", coarse colours: the network to the rig is slow";
+        }
+        line
+    }
+
+    fn details(&self, state: &ReceiverState, now: Instant) -> Vec<String> {
+        let (bytes, motions) = state.rates(now);
+        let shown = self.shown.changes.len() as f64 / RATE_OVER.as_secs_f64();
+        let took_ms = 1e3 * self.shown.took.as_secs_f64();
+        let rates = format!("{shown:.1} of {motions:.1} frames/s shown   {:.2} Mbit/s", 8e-6 * bytes);
+        let mut lines = vec![rates, format!("drawn in {took_ms:.0} ms by {}", self.painter.adapter)];
+        if let (None, Some((latency, _))) = (self.shown.age_secs, state.age) {
+            // By another host's clock, or a recording's, only the latency is known.
+            lines.push(format!("latency {:.0} ms", 1e3 * latency));
+        }
+        lines.extend(state.stats.iter().flat_map(|stats| &stats.subjects).map(|subject| {
+            let quality =
+                subject.quality.map_or_else(String::new, |quality| format!(", {:.0} % agree", 100.0 * quality));
+            format!("person {}: {}{quality}", subject.person, subject.state)
+        }));
+        if are_colors_sent(state) && state.color_layers < LAYERS {
+            let reason = if state.is_line_slow { ", as many as the network carries" } else { "" };
+            lines.push(format!("colours: {} of {LAYERS} layers{reason}", state.color_layers));
+        }
+        lines
+    }
+
+    /// Requests a screenshot as soon as a person is shown with all colours, or the time for it is over.
     fn take_shot(&mut self, context: &egui::Context) {
-        if !self.options.screenshot || self.asked_for_shot || !self.shown.is_complete {
+        let Some(limit) = self.options.screenshot_within else { return };
+        let is_late = self.started.elapsed().as_secs_f64() >= limit;
+        if self.asked_for_shot || !(self.shown.is_complete || is_late) {
             return;
         }
         self.asked_for_shot = true;
+        let missing = (!self.shown.is_complete).then(|| {
+            let state = self.receiver.state();
+            let trouble = state.trouble(&self.options.transport.rig, &self.endpoint);
+            let colors = || "the colours are incomplete".to_owned();
+            trouble.unwrap_or_else(|| if self.shown.people > 0 { colors() } else { state.absence() })
+        });
         let (shot, repaint) = (Arc::clone(&self.shot), context.clone());
         let callback = egui::ScreenshotCallback::new(move |image| {
             let rgb = image.pixels.iter().flat_map(|pixel| [pixel.r(), pixel.g(), pixel.b()]).collect();
             let [width, height] = image.size.map(|side| side as u32);
-            *lock(&shot) = Some(Screenshot { width, height, rgb });
+            *lock(&shot) = Some(Screenshot { width, height, rgb, missing });
             repaint.request_repaint();
         });
         context.send_viewport_cmd(egui::ViewportCommand::Screenshot(callback));
     }
 }
 
-/// Returns a line on the tracking quality of each person, and whether it reports a problem.
-fn people_lines(state: &ReceiverState, shown: usize) -> Vec<(String, bool)> {
-    let Some(stats) = &state.stats else { return Vec::new() };
-    let mut lines: Vec<(String, bool)> = stats
-        .subjects
-        .iter()
-        .map(|subject| {
-            let quality =
-                subject.quality.map_or_else(String::new, |quality| format!(", {:.0} % agree", 100.0 * quality));
-            let is_trouble = matches!(subject.state.as_str(), "lost" | "searching" | "recovering");
-            (format!("person {}: {}{quality}", subject.person, subject.state), is_trouble)
-        })
-        .collect();
-    if shown == 0 {
-        lines.push(("The person has left, or the rig has stopped sending".to_owned(), true));
-    }
-    lines
+/// Returns whether colours are sent beside motion; an avatar's are part of it.
+fn are_colors_sent(state: &ReceiverState) -> bool {
+    state.people.iter().any(|(_, person)| !person.template().is_avatar())
 }

@@ -41,11 +41,13 @@
 //! ```
 
 mod ellipsoids;
+mod floor;
 mod navigation;
 mod people;
 mod person;
 
 pub use ellipsoids::{BACKFACING_COSINE, Ellipsoids, faces_away};
+pub use floor::{Floor, SHADOW_SIDE};
 pub use navigation::Navigation;
 pub use people::{Ingested, MAX_PEOPLE, People};
 pub use person::StreamPerson;

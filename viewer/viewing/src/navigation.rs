@@ -3,8 +3,15 @@
 use flyrig_types::{Camera, Intrinsics, Isometry, Rig};
 use glam::DVec3;
 
-/// Range of the distance to the target, metres.
-const DISTANCE_M: std::ops::RangeInclusive<f64> = 0.2..=50.0;
+/// Range of the distance to the target, metres: a rig limits it further.
+const DISTANCE_M: std::ops::RangeInclusive<f64> = 0.4..=50.0;
+/// Farthest distance relative to that of the rig's farthest camera, and at least, metres: farther away a person is a dot.
+const FARTHEST_SHARE: f64 = 2.0;
+const LEAST_FARTHEST_M: f64 = 6.0;
+/// Largest factor of one step of zooming: a wheel that is spun, or two fingers that meet, move no farther.
+const MOST_ZOOM: f64 = 2.5;
+/// Least width of the view relative to its height that the field is kept for: a telephone held upright shows a larger field.
+const LEAST_ASPECT: f64 = 0.7;
 /// Least angle between line of sight and vertical, radians.
 const FROM_POLE: f64 = 0.05;
 /// Vertical field of view, radians.
@@ -42,6 +49,8 @@ pub struct Navigation {
     elevation: f64,
     /// Vertical field of view, radians.
     field: f64,
+    /// Largest distance to the target, metres.
+    farthest: f64,
     /// Position of the followed person at the last update, which keeps the viewer's own shift.
     followed: Option<DVec3>,
 }
@@ -57,8 +66,12 @@ impl Navigation {
             heading: 0.0,
             elevation: 0.1,
             field: FIELD,
+            farthest: *DISTANCE_M.end(),
             followed: None,
         };
+        let reach = |camera: &Camera| camera.position().distance(navigation.target);
+        let farthest = rig.cameras.iter().map(reach).fold(0.0, f64::max);
+        navigation.farthest = (FARTHEST_SHARE * farthest).clamp(LEAST_FARTHEST_M, *DISTANCE_M.end());
         if let Some(camera) = rig.cameras.first() {
             navigation.stand_at(camera.position());
         }
@@ -76,7 +89,7 @@ impl Navigation {
     fn stand_at(&mut self, eye: DVec3) {
         let (x, y) = self.axes();
         let arm = eye - self.target;
-        self.distance = arm.length().clamp(*DISTANCE_M.start(), *DISTANCE_M.end());
+        self.distance = arm.length().clamp(*DISTANCE_M.start(), self.farthest);
         self.heading = arm.dot(y).atan2(arm.dot(x));
         let most = std::f64::consts::FRAC_PI_2 - FROM_POLE;
         self.elevation = (arm.dot(self.up) / arm.length().max(1e-9)).clamp(-1.0, 1.0).asin().clamp(-most, most);
@@ -102,10 +115,19 @@ impl Navigation {
         self.elevation = (self.elevation + down).clamp(-most, most);
     }
 
-    /// Divides the distance to the target by a factor.
+    /// Divides the distance to the target by a factor, at most 2.5 at a time, within limits of the rig.
     pub fn zoom(&mut self, factor: f64) {
         if factor.is_finite() && factor > 0.0 {
-            self.distance = (self.distance / factor).clamp(*DISTANCE_M.start(), *DISTANCE_M.end());
+            let factor = factor.clamp(1.0 / MOST_ZOOM, MOST_ZOOM);
+            self.distance = (self.distance / factor).clamp(*DISTANCE_M.start(), self.farthest);
+        }
+    }
+
+    /// Moves the target to a point, metres, and the eye along with it.
+    pub fn look_at(&mut self, place: DVec3) {
+        if place.is_finite() {
+            self.target = place;
+            self.followed = None;
         }
     }
 
@@ -116,7 +138,7 @@ impl Navigation {
         self.target += aside * right + aside.cross(ahead) * up + ahead * forward;
     }
 
-    /// Shifts the view by fractions of its height, so that the target follows the pointer.
+    /// Shifts the view by fractions of its height, so that the target follows the pointer (in a view that is not narrow).
     pub fn shift(&mut self, right: f64, down: f64) {
         let height = 2.0 * self.distance * (0.5 * self.field).tan();
         self.fly(-right * height, down * height, 0.0);
@@ -135,7 +157,7 @@ impl Navigation {
     pub fn jump(&mut self, camera: &Camera) {
         let eye = camera.position();
         let ahead = camera.camera_from_world.rotation.inverse() * DVec3::Z;
-        let reach = (self.target - eye).dot(ahead).clamp(0.5, *DISTANCE_M.end());
+        let reach = (self.target - eye).dot(ahead).clamp(0.5, self.farthest);
         self.target = eye + ahead * reach;
         self.stand_at(eye);
         let lens = &camera.intrinsics;
@@ -145,7 +167,8 @@ impl Navigation {
     /// Returns the camera of an image of this size, pixels.
     #[must_use]
     pub fn camera(&self, width: u32, height: u32) -> Camera {
-        let focal = 0.5 * f64::from(height) / (0.5 * self.field).tan();
+        let shown = f64::from(height).min(f64::from(width) / LEAST_ASPECT);
+        let focal = 0.5 * shown / (0.5 * self.field).tan();
         Camera {
             time_offset_nanos: 0,
             color: Default::default(),
@@ -219,6 +242,32 @@ mod tests {
         let view = navigation.camera(640, 480);
         navigation.follow(Some(DVec3::splat(100.0)));
         assert_eq!(navigation.camera(640, 480), view);
+    }
+
+    #[test]
+    fn zooming_keeps_the_person_in_sight() {
+        let rig = rig();
+        let mut navigation = Navigation::new(&rig);
+        let start = navigation.distance();
+        navigation.zoom((-15.0f64).exp());
+        assert!(navigation.distance() <= MOST_ZOOM * start + 1e-9);
+        for _ in 0..10_000 {
+            navigation.zoom(0.5);
+        }
+        // 1.8 m are at least a twelfth of the view's height.
+        let focal = navigation.camera(640, 480).intrinsics.focal_px.y;
+        assert!(1.8 * focal / navigation.distance() > 480.0 / 12.0, "{}", navigation.distance());
+        for _ in 0..10_000 {
+            navigation.zoom(2.0);
+        }
+        assert!((navigation.distance() - DISTANCE_M.start()).abs() < 1e-9);
+        // A telephone that is held upright shows as much to both sides as a wider one.
+        let side = |width: u32| f64::from(width) / navigation.camera(width, 800).intrinsics.focal_px.x;
+        assert!((side(400) - side(560)).abs() < 1e-9 && side(800) > side(560));
+        navigation.look_at(DVec3::new(1.0, 2.0, 0.5));
+        navigation.look_at(DVec3::NAN);
+        let pixel = navigation.camera(640, 480).project(DVec3::new(1.0, 2.0, 0.5)).unwrap();
+        assert!(pixel.distance(DVec2::new(319.5, 239.5)) < 0.1, "{pixel}");
     }
 
     #[test]

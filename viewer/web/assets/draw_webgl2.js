@@ -84,12 +84,31 @@ void main() {
 const WHOLE = `#version 300 es
 void main() { gl_Position = vec4(vec2(gl_VertexID & 1, gl_VertexID >> 1) * 4.0 - 1.0, 0.0, 1.0); }`;
 
-// Straight alpha over the background, on sRGB values, as in the images of the rig.
+// Straight alpha over the background and the floor (viewer/viewing/src/floor.rs), on sRGB values, as in the images of the rig.
 const COMPOSE = `#version 300 es
 precision highp float;
 uniform sampler2D light;
+uniform sampler2D shadow;
 uniform vec3 background;
+uniform mat4 cameraFromWorld;
+uniform vec3 lens;
+uniform float height;
+uniform vec4 ground[3]; // Floor::numbers
 out vec4 color;
+vec3 behind() {
+  mat3 rotation = mat3(cameraFromWorld);
+  vec3 eye = -(cameraFromWorld[3].xyz * rotation);
+  vec2 pixel = vec2(gl_FragCoord.x, height - gl_FragCoord.y) - 0.5;
+  vec3 sight = vec3((pixel - lens.yz) / lens.x, 1.0) * rotation;
+  vec3 up = cross(ground[1].xyz, ground[2].xyz);
+  float above = dot(eye - ground[0].xyz, up), down = -dot(sight, up), radius = ground[0].w;
+  if (!(radius > 0.0 && above > 0.0 && down > 1e-4)) return background;
+  vec3 hit = eye + sight * (above / down) - ground[0].xyz;
+  vec2 at = vec2(dot(hit, ground[1].xyz), dot(hit, ground[2].xyz));
+  float fade = max(1.0 - dot(at, at) / (radius * radius), 0.0);
+  float dark = texture(shadow, at / (2.0 * ground[1].w) + 0.5).r * sqrt(fade);
+  return (background + ${46 / 255} * fade * fade) * (1.0 - 0.7 * dark);
+}
 vec3 srgb(vec3 c) {
   c = clamp(c, 0.0, 1.0);
   return mix(12.92 * c, 1.055 * pow(c, vec3(1.0 / 2.4)) - 0.055, step(0.0031308, c));
@@ -97,7 +116,7 @@ vec3 srgb(vec3 c) {
 void main() {
   vec4 seen = texelFetch(light, ivec2(gl_FragCoord.xy), 0);
   vec3 person = seen.a > 0.0 ? srgb(seen.rgb / seen.a) : vec3(0.0);
-  color = vec4(mix(background, person, min(seen.a, 1.0)), 1.0);
+  color = vec4(mix(behind(), person, min(seen.a, 1.0)), 1.0);
 }`;
 
 function program(gl, vertex, fragment) {
@@ -146,6 +165,8 @@ export class WebGl2Drawing {
     this.four = [gl.RGBA32F, gl.RGBA, gl.FLOAT, 4];
     this.one = [gl.R32UI, gl.RED_INTEGER, gl.UNSIGNED_INT, 1];
     this.light = gl.createTexture();
+    this.shadow = gl.createTexture();
+    this.ground = new Float32Array(12); // nothing
     this.frame = gl.createFramebuffer();
     this.size = [0, 0];
   }
@@ -193,6 +214,20 @@ export class WebGl2Drawing {
   /** Sets the standard deviations along the axes; opacities are those of the colours, and `order` omits Gaussians that face away. */
   setScales(scales, count) { this.upload(this.scales, scales, count, this.four); }
 
+  /** Sets the floor: Floor::numbers, and the shadow where it has changed, `side` squared bytes. */
+  setFloor(numbers, shadow, side) {
+    this.ground.set(numbers);
+    if (!shadow) return;
+    const gl = this.gl;
+    gl.activeTexture(gl.TEXTURE5);
+    gl.bindTexture(gl.TEXTURE_2D, this.shadow);
+    gl.pixelStorei(gl.UNPACK_ALIGNMENT, 1);
+    gl.texImage2D(gl.TEXTURE_2D, 0, gl.R8, side, side, 0, gl.RED, gl.UNSIGNED_BYTE, shadow);
+    for (const name of [gl.TEXTURE_MIN_FILTER, gl.TEXTURE_MAG_FILTER]) gl.texParameteri(gl.TEXTURE_2D, name, gl.LINEAR);
+    for (const name of [gl.TEXTURE_WRAP_S, gl.TEXTURE_WRAP_T]) gl.texParameteri(gl.TEXTURE_2D, name, gl.CLAMP_TO_EDGE);
+    gl.activeTexture(gl.TEXTURE0);
+  }
+
   /** Draws the Gaussians of `order`, farthest first, with a camera of 19 numbers (viewer/page/src/page.rs). */
   draw(camera, background, order) {
     const gl = this.gl;
@@ -236,7 +271,15 @@ export class WebGl2Drawing {
     gl.activeTexture(gl.TEXTURE0);
     gl.bindTexture(gl.TEXTURE_2D, this.light);
     gl.uniform1i(this.compose.place("light"), 0);
+    gl.activeTexture(gl.TEXTURE5);
+    gl.bindTexture(gl.TEXTURE_2D, this.shadow);
+    gl.uniform1i(this.compose.place("shadow"), 5);
+    gl.activeTexture(gl.TEXTURE0);
     gl.uniform3fv(this.compose.place("background"), background);
+    gl.uniformMatrix4fv(this.compose.place("cameraFromWorld"), false, camera.subarray(0, 16));
+    gl.uniform3fv(this.compose.place("lens"), camera.subarray(16, 19));
+    gl.uniform1f(this.compose.place("height"), height);
+    gl.uniform4fv(this.compose.place("ground"), this.ground);
     gl.drawArrays(gl.TRIANGLES, 0, 3);
     gl.bindVertexArray(null);
   }

@@ -4,11 +4,31 @@
 const SLOT_BYTES = 256; // constants lie this far apart: offsets of bindings may be any multiple of it
 const MOST_GROUPS = 65535; // workgroups of a dispatch in one dimension
 
-// Straight alpha over the background, on sRGB values, as in the images of the rig. After the module `srgb`.
+// Straight alpha over the background and the floor (viewer/viewing/src/floor.rs), on sRGB values, as in the images of the rig. After the
+// module `srgb`.
 const COMPOSE = `
-struct View { background: vec4<f32>, width: u32 }
+struct View { camera_from_world: mat4x4<f32>, ground: array<vec4<f32>, 3>, background: vec4<f32>, lens: vec3<f32>, width: u32 }
 @group(0) @binding(0) var<storage, read> light: array<vec4<f32>>;
 @group(0) @binding(1) var<storage, read> view: View;
+@group(0) @binding(2) var shadow: texture_2d<f32>;
+@group(0) @binding(3) var linear: sampler;
+fn behind(pixel: vec2<f32>) -> vec3<f32> {
+  let moved = view.camera_from_world;
+  let rotation = mat3x3(moved[0].xyz, moved[1].xyz, moved[2].xyz);
+  let eye = -(moved[3].xyz * rotation);
+  let sight = vec3((pixel - view.lens.yz) / view.lens.x, 1.0) * rotation;
+  let center = view.ground[0].xyz;
+  let radius = view.ground[0].w;
+  let up = cross(view.ground[1].xyz, view.ground[2].xyz);
+  let above = dot(eye - center, up);
+  let down = -dot(sight, up);
+  if !(radius > 0.0 && above > 0.0 && down > 1e-4) { return view.background.rgb; }
+  let hit = eye + sight * (above / down) - center;
+  let at = vec2(dot(hit, view.ground[1].xyz), dot(hit, view.ground[2].xyz));
+  let fade = max(1.0 - dot(at, at) / (radius * radius), 0.0);
+  let dark = textureSampleLevel(shadow, linear, at / (2.0 * view.ground[1].w) + 0.5, 0.0).r * sqrt(fade);
+  return (view.background.rgb + ${46 / 255} * fade * fade) * (1.0 - 0.7 * dark);
+}
 @vertex fn whole(@builtin(vertex_index) index: u32) -> @builtin(position) vec4<f32> {
   return vec4(vec2<f32>(vec2(index & 1u, index >> 1u)) * 4.0 - 1.0, 0.0, 1.0);
 }
@@ -19,7 +39,7 @@ fn srgb(linear: vec3<f32>) -> vec3<f32> {
 @fragment fn compose(@builtin(position) at: vec4<f32>) -> @location(0) vec4<f32> {
   let seen = light[u32(at.y) * view.width + u32(at.x)];
   let person = select(vec3(0.0), srgb(seen.rgb / seen.a), seen.a > 0.0);
-  return vec4(mix(view.background.rgb, person, min(seen.a, 1.0)), 1.0);
+  return vec4(mix(behind(at.xy - 0.5), person, min(seen.a, 1.0)), 1.0);
 }`;
 
 // Modules and their entry points. A kernel is named after its entry point, or after a module that has only one.
@@ -66,6 +86,9 @@ export class WebGpuDrawing {
       layout: "auto", vertex: { module, entryPoint: "whole" }, fragment: { module, entryPoint: "compose", targets: [{ format }] },
     });
     this.buffers = new Map(); // by name
+    this.ground = new Float32Array(12); // no floor
+    this.linear = device.createSampler({ magFilter: "linear", minFilter: "linear" });
+    this.setFloor(this.ground, new Uint8Array(1), 1);
     this.count = 0;
     this.hasAxes = false;
     this.planned = ""; // count, size and kind of the present steps
@@ -106,6 +129,19 @@ export class WebGpuDrawing {
   /** Sets the standard deviations along the axes, and the opacities for the camera. */
   setScales(scales) { this.write("scales", scales); }
 
+  /** Sets the floor: Floor::numbers, and the shadow where it has changed, `side` squared bytes. */
+  setFloor(numbers, shadow, side) {
+    this.ground.set(numbers);
+    if (!shadow) return;
+    if (this.shadow?.width !== side) {
+      this.shadow?.destroy();
+      const usage = GPUTextureUsage.TEXTURE_BINDING | GPUTextureUsage.COPY_DST;
+      this.shadow = this.device.createTexture({ size: [side, side], format: "r8unorm", usage });
+      this.planned = "";
+    }
+    this.device.queue.writeTexture({ texture: this.shadow }, shadow, { bytesPerRow: side }, [side, side]);
+  }
+
   /** Builds the steps of an image: kernel, bind group, and workgroups or the place in "work" that holds their number. */
   plan(width, height) {
     const { count, kernels, device } = this;
@@ -129,7 +165,7 @@ export class WebGpuDrawing {
     make("sums", 4 * segments);
     make("ends", 4 * columns * rows);
     make("light", 16 * width * height);
-    make("view", 32);
+    make("view", 144);
     make("constants", 16 * SLOT_BYTES);
     for (const [sort, elements] of [["depth", count], ["list", pairs]]) {
       make(`${sort}Elements`, 8 * elements);
@@ -194,7 +230,8 @@ export class WebGpuDrawing {
     this.own = own;
     this.pairs = pairs;
     this.tiles = [columns, rows];
-    const entries = [own.light, own.view].map((buffer, binding) => ({ binding, resource: { buffer } }));
+    const resources = [{ buffer: own.light }, { buffer: own.view }, this.shadow.createView(), this.linear];
+    const entries = resources.map((resource, binding) => ({ binding, resource }));
     this.composed = device.createBindGroup({ layout: this.compose.getBindGroupLayout(0), entries });
   }
 
@@ -234,9 +271,9 @@ export class WebGpuDrawing {
         this.planned = wanted;
       }
       device.queue.writeBuffer(this.own.constants, this.frame.offset, this.frameConstants(camera, width, height));
-      const view = new ArrayBuffer(32); // struct View above
-      new Float32Array(view).set(background);
-      new Uint32Array(view)[4] = width;
+      const view = new ArrayBuffer(144); // struct View above
+      new Float32Array(view).set([...camera.subarray(0, 16), ...this.ground, ...background, 1, ...camera.subarray(16, 19)]);
+      new Uint32Array(view)[35] = width;
       device.queue.writeBuffer(this.own.view, 0, view);
       for (const extremes of [this.own.depthExtremes, this.own.listExtremes]) encoder.clearBuffer(extremes);
       const pass = encoder.beginComputePass();

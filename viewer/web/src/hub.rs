@@ -10,7 +10,8 @@ use flyrig_types::lock;
 use bytes::{BufMut as _, Bytes, BytesMut};
 use tokio::sync::Notify;
 
-/// Largest number of waiting bytes of colours per browser; beyond it the oldest are dropped, and refreshed within a second.
+/// Largest number of waiting bytes of changes of colours per browser; beyond it they are dropped, and the browser gets the present colours
+/// once there is room.
 const COLOR_BYTES: usize = 256 << 10;
 /// Largest number of people whose messages are kept.
 const MAX_PEOPLE: usize = 32;
@@ -65,8 +66,12 @@ struct Browser {
     rig: Option<Bytes>,
     templates: BTreeMap<u32, Bytes>,
     motions: BTreeMap<u32, Bytes>,
+    /// Present colours of people, which go before changes.
+    whole: VecDeque<Bytes>,
     colors: VecDeque<Bytes>,
     color_bytes: usize,
+    /// Whether the present colours are missing.
+    wants_whole: bool,
     state: Option<Bytes>,
 }
 
@@ -75,7 +80,8 @@ impl Browser {
     fn take(&mut self) -> Option<Bytes> {
         let first = |map: &mut BTreeMap<u32, Bytes>| map.pop_first().map(|(_, bytes)| bytes);
         let next = self.forget.take().or_else(|| self.rig.take()).or_else(|| first(&mut self.templates));
-        next.or_else(|| first(&mut self.motions)).or_else(|| self.state.take()).or_else(|| {
+        let next = next.or_else(|| first(&mut self.motions)).or_else(|| self.state.take());
+        next.or_else(|| self.whole.pop_front()).or_else(|| {
             let colors = self.colors.pop_front()?;
             self.color_bytes -= colors.len();
             Some(colors)
@@ -83,11 +89,19 @@ impl Browser {
     }
 
     fn push_colors(&mut self, colors: Bytes) {
+        if self.color_bytes + colors.len() > COLOR_BYTES && !self.colors.is_empty() {
+            // Too slow for changes: the present state replaces them.
+            self.colors.clear();
+            self.color_bytes = 0;
+            self.wants_whole = true;
+        }
         self.color_bytes += colors.len();
         self.colors.push_back(colors);
-        while self.color_bytes > COLOR_BYTES && self.colors.len() > 1 {
-            self.color_bytes -= self.colors.pop_front().map_or(0, |dropped| dropped.len());
-        }
+    }
+
+    /// Returns whether the present colours are missing and there is room for them.
+    fn is_ready_for_whole(&self) -> bool {
+        self.wants_whole && self.whole.is_empty() && self.templates.is_empty()
     }
 }
 
@@ -116,6 +130,7 @@ impl Hub {
             templates: inner.templates.iter().map(|(person, (_, bytes))| (*person, bytes.clone())).collect(),
             motions: inner.motions.clone(),
             state: inner.state.clone(),
+            wants_whole: true,
             ..Browser::default()
         };
         wake.notify_one();
@@ -171,6 +186,27 @@ impl Hub {
     pub fn colors(&self, person: u32, payload: &[u8]) {
         let bytes = message(Kind::Colors, person, payload);
         Self::to_all(&mut self.lock(), |browser| browser.push_colors(bytes.clone()));
+    }
+
+    /// Returns whether a browser lacks the present colours and has room for them.
+    pub fn wants_whole(&self) -> bool {
+        self.lock().browsers.values().any(Browser::is_ready_for_whole)
+    }
+
+    /// Sends the present colours of all people to the browsers that lack them.
+    pub fn whole(&self, people: &[(u32, Vec<Vec<u8>>)]) {
+        let of_person = |(person, messages): &(u32, Vec<Vec<u8>>)| {
+            messages.iter().map(|payload| message(Kind::Colors, *person, payload)).collect::<Vec<_>>()
+        };
+        let messages: Vec<Bytes> = people.iter().flat_map(of_person).collect();
+        let mut inner = self.lock();
+        for browser in inner.browsers.values_mut().filter(|browser| browser.is_ready_for_whole()) {
+            // The changes so far are part of the state.
+            browser.colors.clear();
+            (browser.color_bytes, browser.wants_whole) = (0, false);
+            browser.whole.extend(messages.iter().cloned());
+            browser.wake.notify_one();
+        }
     }
 
     /// Sends the status of the rig.
@@ -263,9 +299,17 @@ mod tests {
         assert_eq!(drain(&place), expected);
         assert!(drain(&place).is_empty());
         drop(place);
-        // A later browser starts with the messages that are not repeated.
+        // A later browser starts with the messages that are not repeated, and with the present colours once.
         let late = hub.join(1).unwrap();
-        assert_eq!(drain(&late), expected[..4]);
+        hub.colors(3, b"part of the whole");
+        assert!(!hub.wants_whole(), "the template comes first");
+        assert_eq!(drain(&late)[..4], expected[..4]);
+        assert!(hub.wants_whole());
+        hub.colors(3, b"part of the whole as well");
+        hub.whole(&[(3, vec![b"w0".to_vec(), b"w1".to_vec()])]);
+        hub.colors(3, b"c3");
+        assert!(!hub.wants_whole());
+        assert_eq!(drain(&late), [(3, 3, text(b"w0")), (3, 3, text(b"w1")), (3, 3, text(b"c3"))]);
         hub.motion(3, b"m4");
         hub.forget_people();
         assert_eq!(drain(&late), [(5, 0, Vec::new())]);
@@ -288,6 +332,11 @@ mod tests {
         let count = |kind: u8| waiting.iter().filter(|(of, ..)| *of == kind).count();
         assert_eq!((count(1), count(2)), (MAX_PEOPLE, MAX_PEOPLE));
         assert!(count(3) * layer.len() <= COLOR_BYTES && count(3) > 0, "{}", count(3));
+        // The lost colours are replaced by the present ones, once.
+        assert!(hub.wants_whole());
+        hub.whole(&[(0, vec![layer.clone()])]);
+        hub.whole(&[(0, vec![layer.clone()])]);
+        assert_eq!(drain(&place).len(), 1);
         // One message beyond the bound still comes.
         hub.colors(0, &vec![1u8; 2 * COLOR_BYTES]);
         assert_eq!(drain(&place).len(), 1);

@@ -437,3 +437,35 @@ fn sockets_without_a_token_are_bounded_and_delay_no_other() {
         std::thread::sleep(Duration::from_millis(100));
     }
 }
+
+#[test]
+fn browsers_that_join_between_two_rare_frame_sets_see_the_person_whole() {
+    let config = TransportConfig { listen: vec!["tcp/127.0.0.1:0".to_owned()], ..TransportConfig::publisher(NAME) };
+    let publisher = Publisher::open(&config).unwrap();
+    publisher.set_calibration(&cameras()).unwrap();
+    let encoded = template(1.0);
+    let hash = encoded.template.hash;
+    publisher.offer_template(4, hash, encoded.bytes.clone().into());
+    let stamp = Stamp { template: hash, person: 4, frame: 7, capture_nanos: 1 };
+    let joint_rotations = vec![[0.0, 0.0, 0.0, 1.0]];
+    let motion = Motion { stamp, root_translation: [0.0, 0.0, 1.0], joint_rotations, nodes: Vec::new() };
+    publisher.publish_person(&stamp, None, MotionEncoder::new(&encoded).encode(&motion).unwrap().into());
+    let mut encoder = ColorEncoder::new(&encoded, ColorSettings::default(), 1);
+    for (layer, bytes) in encoder.encode(stamp, &[[0.5, 0.2, 0.1, 1.0]; GAUSSIANS]).into_iter().enumerate() {
+        publisher.publish_person(&stamp, Some(layer), bytes.into());
+    }
+    // Nothing more is published: the first browser gets what was, the second what the first one got.
+    let server = server(&publisher.endpoints()[0], "127.0.0.1:0", false);
+    let mut open = Vec::new();
+    for _ in 0..2 {
+        let (mut socket, mut page) = (browser(server.address(), ""), Page::default());
+        let has_floor = |page: &Page| page.floor().is_some_and(|floor| floor.numbers()[3] > 0.0);
+        watch(&mut socket, &mut page, "a whole person on the floor", |page, _| {
+            page.people_shown() == 1 && page.is_complete() && has_floor(page)
+        });
+        assert!(page.colors().iter().all(|color| (color[0] - 0.5).abs() < 0.05 && (color[2] - 0.1).abs() < 0.05));
+        page.choose(4);
+        assert_eq!((page.person(0), page.person(1)), (Some(4), None));
+        open.push((socket, page));
+    }
+}

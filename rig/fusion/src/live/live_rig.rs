@@ -257,7 +257,7 @@ impl LiveRig {
         if self.splats && publisher.publisher().has_splat_subscribers() {
             publisher.publish_splats(&self.session, set)?;
         }
-        if publisher.publisher().has_person_subscribers() {
+        if publisher.wants_people() {
             publisher.publish_people(&self.session, set)?;
         }
         if let Some(age) = self.ages.as_ref().and_then(|ages| ages.of(set.master_nanos)) {

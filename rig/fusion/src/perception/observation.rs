@@ -37,6 +37,11 @@ pub trait Perception: Send {
     /// Measures people in threads of their own from now on, so that no frame set waits for it.
     fn use_threads(&mut self) {}
 
+    /// Returns whether a person is seen whose shape is not known yet.
+    fn is_measuring(&self) -> bool {
+        false
+    }
+
     /// Chooses the work that the next frame sets get.
     fn set_effort(&mut self, effort: Effort) {
         let _ = effort;

@@ -29,6 +29,8 @@ const WAITING_PICTURES: usize = 8;
 const BACKDROP: u8 = 30;
 /// Time from one publishing of statistics to the next.
 const STATS_EVERY: Duration = Duration::from_secs(1);
+/// Interval of frame sets above which people are published without subscribers.
+const SLOW_SET: Duration = Duration::from_millis(400);
 
 /// View to compress and publish.
 struct ViewJob {
@@ -50,6 +52,8 @@ pub struct LivePublisher {
     failures: Arc<AtomicU64>,
     started: Instant,
     last_stats: Instant,
+    /// Time of the last frame set that could be published.
+    last_set: Instant,
     frames_at_last_stats: u64,
 }
 
@@ -90,6 +94,7 @@ impl LivePublisher {
             failures,
             started: Instant::now(),
             last_stats: Instant::now(),
+            last_set: Instant::now(),
             frames_at_last_stats: 0,
         })
     }
@@ -136,6 +141,13 @@ impl LivePublisher {
             self.publisher.publish_splats(Arc::new(state));
         }
         Ok(())
+    }
+
+    /// Returns whether the people of this frame set are to be published: to subscribers, and by a slow rig also without any, so that a
+    /// viewer that joins need not wait for the next frame set.
+    pub fn wants_people(&mut self) -> bool {
+        let interval = std::mem::replace(&mut self.last_set, Instant::now()).elapsed();
+        interval >= SLOW_SET || self.publisher.has_person_subscribers()
     }
 
     /// Reads back the colours of all people and queues them with the motion.
@@ -217,6 +229,7 @@ impl LivePublisher {
             budget: session.budget.stats(),
             tracking: TrackingStats::default(),
             subjects: session.subjects().iter().map(stats_of).collect(),
+            measuring_secs: session.measuring().map(|since| since.as_secs_f64()),
         }
     }
 

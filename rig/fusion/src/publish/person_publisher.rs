@@ -2,14 +2,18 @@
 //!
 //! With `output.avatar` the template of the first person is the avatar itself, and every frame is a pose: no node translations, no colours.
 //! While a viewer subscribes, each frame set yields one [`PersonFrame`] per person. Motion is published before the colours, which take
-//! longer to encode. Templates are offered by their hash; viewers fetch each once.
+//! longer to encode. Templates are offered by their hash; viewers fetch each once, and the present colours with it.
 
-use std::{collections::BTreeMap, sync::Arc, time::Duration};
+use std::{
+    collections::BTreeMap,
+    sync::{Arc, Mutex},
+    time::Duration,
+};
 
 use flyrig_capture::{LatestQueue, PopError};
-use flyrig_stream::{ColorEncoder, ColorSettings, LAYERS, MotionEncoder, Stamp};
-use flyrig_transport::Publisher;
-use flyrig_types::{PersonId, SupervisedThread, ThreadHealth};
+use flyrig_stream::{ColorEncoder, ColorSettings, LAYERS, MotionEncoder, Stamp, WholeColors};
+use flyrig_transport::{Publisher, SharedColors};
+use flyrig_types::{PersonId, SupervisedThread, ThreadHealth, lock};
 
 use crate::{error::FusionError, subject::stream_frame::PersonFrame};
 
@@ -23,8 +27,17 @@ pub struct PersonEncoder {
     motion: MotionEncoder,
     settings: ColorSettings,
     epoch: u32,
-    /// `None` before the first colours, since motion does not wait for it.
-    colors: Option<ColorEncoder>,
+    colors: Arc<FrameColors>,
+}
+
+/// Encoder of one person's colours; `None` before the first colours, since motion does not wait for it.
+#[derive(Debug, Default)]
+struct FrameColors(Mutex<Option<ColorEncoder>>);
+
+impl WholeColors for FrameColors {
+    fn whole(&self, first_layer: usize) -> Vec<(usize, Vec<u8>)> {
+        lock(&self.0).as_ref().map(|encoder| encoder.whole(first_layer)).unwrap_or_default()
+    }
 }
 
 /// Messages of one frame: motion, and the layers of the colours.
@@ -47,8 +60,14 @@ impl PersonEncoder {
             motion: MotionEncoder::new(&frame.template),
             settings,
             epoch,
-            colors: None,
+            colors: Arc::default(),
         }
+    }
+
+    /// Returns the colours, for viewers that join.
+    #[must_use]
+    pub fn colors(&self) -> SharedColors {
+        self.colors.clone()
     }
 
     /// Encodes a frame.
@@ -75,7 +94,8 @@ impl PersonEncoder {
         }
         let stamp = self.stamp(frame);
         let (settings, epoch) = (self.settings, self.epoch);
-        let encoder = self.colors.get_or_insert_with(|| ColorEncoder::new(&frame.template, settings, epoch));
+        let mut colors = lock(&self.colors.0);
+        let encoder = colors.get_or_insert_with(|| ColorEncoder::new(&frame.template, settings, epoch));
         encoder.encode(stamp, &frame.colors)
     }
 }
@@ -138,8 +158,14 @@ fn publish(publisher: &Publisher, encoders: &mut BTreeMap<u32, PersonEncoder>, f
         while encoders.len() > flyrig_transport::MAX_PERSON_TOPICS {
             encoders.pop_first();
         }
-        publisher.offer_template(person, template.template.hash, template.bytes.clone().into());
-        encoders.insert(person, PersonEncoder::new(frame, ColorSettings::default(), epoch()));
+        let encoder = PersonEncoder::new(frame, ColorSettings::default(), epoch());
+        let (hash, bytes) = (encoder.hash, template.bytes.clone().into());
+        if template.template.is_avatar() {
+            publisher.offer_template(person, hash, bytes);
+        } else {
+            publisher.offer_template_with(person, hash, bytes, encoder.colors());
+        }
+        encoders.insert(person, encoder);
     }
     let Some(encoder) = encoders.get_mut(&person) else { return };
     match encoder.encode_motion(frame) {

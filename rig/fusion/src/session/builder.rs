@@ -87,6 +87,7 @@ impl SessionBuilder {
             subjects: Vec::new(),
             saved: self.saved,
             newcomers: Newcomers::default(),
+            measuring_since: None,
             keep_observations: false,
             shape_held: false,
             stages: StageTimes::default(),

@@ -19,7 +19,11 @@ pub(crate) mod perceiver;
 mod stillness;
 pub(crate) mod view_renderer;
 
-use std::{collections::BTreeMap, sync::Arc, time::Instant};
+use std::{
+    collections::BTreeMap,
+    sync::Arc,
+    time::{Duration, Instant},
+};
 
 use flyrig_gpu::GpuContext;
 use flyrig_renderer::{GaussianBuffers, RenderTarget, Splat};
@@ -61,6 +65,8 @@ pub struct Session {
     /// Memories of people who are not subjects yet.
     saved: BTreeMap<PersonId, PersonMemory>,
     newcomers: Newcomers,
+    /// Time since which a person is seen who cannot be shown yet.
+    measuring_since: Option<Instant>,
     keep_observations: bool,
     shape_held: bool,
     stillness: Stillness,
@@ -95,6 +101,13 @@ impl Session {
     #[must_use]
     pub fn subject(&self, person: PersonId) -> Option<&Subject> {
         self.subjects.iter().find(|subject| subject.id() == person)
+    }
+
+    /// Returns for how long a person has been seen who cannot be shown yet, because the shape is being measured; `None` while there is
+    /// no such person.
+    #[must_use]
+    pub fn measuring(&self) -> Option<Duration> {
+        self.measuring_since.map(|since| since.elapsed())
     }
 
     /// Returns whether any person has been posed yet.
@@ -188,7 +201,7 @@ impl Session {
     /// Updates the people from the result of [`Self::perceive`] for the same frame set. Does not use perception.
     pub(crate) fn reconstruct(&mut self, set: &FrameSet, perceived: Perceived) -> Result<Outcome, FusionError> {
         let start = Instant::now();
-        let Perceived::People { observations, newcomers, effort, stages, took } = perceived else {
+        let Perceived::People { observations, newcomers, is_measuring, effort, stages, took } = perceived else {
             self.budget.leave_out();
             self.stages.count("sets left out, nothing moved", 1);
             return Ok(Outcome::Still);
@@ -196,6 +209,8 @@ impl Session {
         self.stages.merge(&stages);
         let before = self.gpu.traffic();
         let outcome = self.update_people(set, observations, newcomers, effort);
+        let since = self.measuring_since.unwrap_or(start);
+        self.measuring_since = (is_measuring || self.newcomers.are_preparing()).then_some(since);
         self.stages.count_traffic(self.gpu.traffic().since(before));
         self.stillness.ingested(set.master_nanos, took + start.elapsed());
         outcome

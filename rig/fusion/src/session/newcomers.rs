@@ -40,6 +40,11 @@ impl Newcomers {
         self.preparing.contains_key(&person)
     }
 
+    /// Returns whether any subject is being prepared.
+    pub fn are_preparing(&self) -> bool {
+        !self.preparing.is_empty()
+    }
+
     /// Returns the subject of a newcomer, or `None` while it is being prepared: call it again with that newcomer.
     ///
     /// # Errors

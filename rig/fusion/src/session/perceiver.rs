@@ -22,6 +22,8 @@ pub(crate) enum Perceived {
         observations: Vec<PersonObservation>,
         /// People whom the session did not know when perception began, or knew in another shape.
         newcomers: Vec<Newcomer>,
+        /// Whether a person is seen whose shape is not known yet.
+        is_measuring: bool,
         /// Work that the frame set gets.
         effort: Effort,
         /// Run times of perception's stages.
@@ -81,7 +83,8 @@ impl Perceiver {
         self.perception.set_effort(self.effort);
         let observations = self.perception.observe(set, &mut stages)?;
         let newcomers = self.newcomers(&self.known);
-        Ok(Perceived::People { observations, newcomers, effort: self.effort, stages, took: start.elapsed() })
+        let (is_measuring, effort) = (self.perception.is_measuring(), self.effort);
+        Ok(Perceived::People { observations, newcomers, is_measuring, effort, stages, took: start.elapsed() })
     }
 
     /// Returns the people whom perception knows but who are not among `known` in this shape.

@@ -54,6 +54,16 @@ const FIRST_LAYER: f64 = 0.2;
 const FORGOTTEN: f64 = 0.05;
 /// Time without congestion before a layer is tried that the line does not seem to carry.
 const UNLIKELY_TRIAL: Duration = Duration::from_secs(60);
+/// Most bytes of motion and all colours of a frame set, those of a slow rig (`flyrig_stream::ColorSettings::max_frame_bytes`), and the
+/// interval assumed before it is known. A line that was measured to carry twice as much gets all layers at once.
+const MOST_SET_BYTES: f64 = 36e3;
+const MOST_SLOW_SET_BYTES: f64 = 8.0 * MOST_SET_BYTES;
+const UNKNOWN_INTERVAL_SECS: f64 = 1.0 / 30.0;
+const RESERVE: f64 = 2.0;
+/// Fraction by which the longest interval of motions decays per motion.
+const INTERVAL_FORGOTTEN: f64 = 0.3;
+/// Interval of motions above which a refresh of all colours takes longer than a second.
+const SLOW_INTERVAL_SECS: f64 = 0.25;
 
 /// Chooses the number of layers to subscribe to.
 #[derive(Debug)]
@@ -82,6 +92,12 @@ pub(crate) struct ColorLayers {
     bytes_per_sec: [f64; 1 + LAYERS],
     /// Arrival of the last motion.
     last: Option<Instant>,
+    /// Recent longest interval of motions, seconds.
+    interval_secs: Option<f64>,
+    /// Time since the last motion during which a fetch held it up, seconds.
+    fetching_secs: f64,
+    /// Whether the line was congested since all layers were subscribed to.
+    has_been_congested: bool,
     window_began: Instant,
     /// Time of the last change, and whether it added a layer.
     changed: Option<(Instant, bool)>,
@@ -108,6 +124,9 @@ impl ColorLayers {
             bytes: [0; 1 + LAYERS],
             bytes_per_sec: [0.0; 1 + LAYERS],
             last: None,
+            interval_secs: None,
+            fetching_secs: 0.0,
+            has_been_congested: false,
             window_began: now,
             changed: None,
             clear_since: None,
@@ -125,10 +144,38 @@ impl ColorLayers {
         self.is_begun
     }
 
-    /// Begins with the coarsest layer; before, motion only measures the line without colours.
+    /// Begins with the coarsest layer, or with all where the line carries them by far; before, motion only measures the line without
+    /// colours.
     pub fn begin(&mut self) {
         if !std::mem::replace(&mut self.is_begun, true) {
             (self.wanted, self.carried) = (1, 1);
+            self.take_all_if_carried();
+        }
+    }
+
+    /// Returns whether frame sets come so rarely that a refresh of all colours takes long.
+    pub fn is_rig_slow(&self) -> bool {
+        self.interval_secs.is_none_or(|interval| interval > SLOW_INTERVAL_SECS)
+    }
+
+    /// Returns whether the line, and not the rate of the rig or the time since the start, is why layers are missing.
+    pub fn is_line_slow(&self) -> bool {
+        self.is_begun && self.wanted < LAYERS && (self.has_been_congested || self.is_unlikely(self.last))
+    }
+
+    /// Returns whether the line was measured to carry less than one more layer needs.
+    fn is_unlikely(&self, now: Option<Instant>) -> bool {
+        let is_valid = |at: Instant| now.is_none_or(|now| now.duration_since(at) < CARRIED_FOR);
+        self.carries.is_some_and(|(at, carried)| is_valid(at) && self.with_one_more() > carried)
+    }
+
+    /// Subscribes to all layers where the measured throughput leaves no doubt: a slow rig would need minutes for trials.
+    fn take_all_if_carried(&mut self) {
+        let Some((_, carried)) = self.carries.filter(|_| self.is_begun && !self.has_been_congested) else { return };
+        let interval = self.interval_secs.unwrap_or(UNKNOWN_INTERVAL_SECS).max(1e-3);
+        let set_bytes = (10.0 * interval * MOST_SET_BYTES).clamp(MOST_SET_BYTES, MOST_SLOW_SET_BYTES);
+        if RESERVE * set_bytes / interval <= carried {
+            (self.wanted, self.carried) = (LAYERS, LAYERS);
         }
     }
 
@@ -148,11 +195,13 @@ impl ColorLayers {
         let Some((begun, sum)) = &mut self.fetched else { return };
         *sum = sum.saturating_add(bytes);
         if self.fetches == 0 {
+            let secs = now.duration_since(*begun).as_secs_f64();
+            self.fetching_secs += secs;
             if *sum >= LEAST_FETCH_BYTES {
-                let secs = now.duration_since(*begun).as_secs_f64().max(1e-3);
-                self.carries = Some((now, *sum as f64 / secs));
+                self.carries = Some((now, *sum as f64 / secs.max(1e-3)));
             }
             self.fetched = None;
+            self.take_all_if_carried();
         }
     }
 
@@ -186,7 +235,14 @@ impl ColorLayers {
             self.latencies.clear();
         }
         self.note_way(now, latency_nanos);
-        let is_pause = self.last.replace(now).is_some_and(|last| now.duration_since(last) > PAUSE);
+        let since_last = self.last.replace(now).map(|last| now.duration_since(last));
+        let is_pause = since_last.is_some_and(|since| since > PAUSE);
+        if let Some(since) = since_last {
+            let since = (since.as_secs_f64() - std::mem::take(&mut self.fetching_secs)).max(0.0);
+            let decayed = self.interval_secs.map_or(0.0, |longest| longest * (1.0 - INTERVAL_FORGOTTEN));
+            self.interval_secs = Some(decayed.max(since));
+            self.take_all_if_carried();
+        }
         let missed = if is_pause { 0 } else { missed };
         self.latencies.push(latency_nanos);
         self.missed = self.missed.saturating_add(missed);
@@ -242,6 +298,7 @@ impl ColorLayers {
             let has_failed = is_trial && since_change.is_some_and(|since| since < SUCCESS);
             self.patience =
                 if has_failed { (2 * self.patience).clamp(LATER_TRIAL, MOST_PATIENCE) } else { LATER_TRIAL };
+            self.has_been_congested = true;
             self.carried = self.wanted - 1;
             // Without any colours, long queues empty sooner.
             self.wanted = if queued_nanos > VERY_LATE_NANOS { 0 } else { self.carried };
@@ -251,6 +308,7 @@ impl ColorLayers {
         if is_trial && since_change.is_some_and(|since| since >= SUCCESS) {
             self.patience = self.patience.min(LATER_TRIAL);
         }
+        self.has_been_congested &= self.wanted < LAYERS || is_trial;
         if queued_nanos > CLEAR_NANOS {
             self.clear_since = None;
             return;
@@ -261,9 +319,7 @@ impl ColorLayers {
             self.changed = Some((now, false));
             return;
         }
-        let carried = self.carries.filter(|(at, _)| now.duration_since(*at) < CARRIED_FOR);
-        let is_unlikely = carried.is_some_and(|(_, carried)| self.with_one_more() > carried);
-        let patience = if is_unlikely { self.patience.max(UNLIKELY_TRIAL) } else { self.patience };
+        let patience = if self.is_unlikely(Some(now)) { self.patience.max(UNLIKELY_TRIAL) } else { self.patience };
         let is_due = now.duration_since(clear_since) >= patience && since_change.is_none_or(|since| since >= patience);
         if is_due && self.wanted < LAYERS {
             self.wanted += 1;
@@ -539,6 +595,35 @@ mod tests {
             line.run(5);
             assert_eq!(line.layers.wanted(), LAYERS, "{rate}");
         }
+    }
+
+    #[test]
+    fn a_slow_rig_is_no_slow_line_and_gets_all_layers_at_once() {
+        // Two motions within half a minute, on a line of 3 Mbit/s and on a fast one.
+        for (rate, at_once) in [(375e3, false), (20e6, true)] {
+            let now = Instant::now();
+            let mut layers = ColorLayers::new(now);
+            layers.motion(now, 1, 0, 0);
+            layers.fetch_begins(now);
+            let arrived = now + flyrig_types::saturating_secs(1.2e6 / rate);
+            layers.fetch_ends(arrived, 1_200_000);
+            layers.begin();
+            assert_eq!(layers.wanted() == LAYERS, at_once, "{rate}");
+            assert!(layers.is_rig_slow() && !layers.is_line_slow());
+            layers.motion(arrived + Duration::from_secs(5), 1, 0, 0);
+            assert_eq!(layers.wanted(), LAYERS, "{rate}");
+            assert!(layers.is_rig_slow() && !layers.is_line_slow());
+        }
+        // Without a measurement, missing layers are nobody's fault.
+        let mut layers = begun(Instant::now());
+        layers.motion(Instant::now() + Duration::from_secs(10), 1, 0, 0);
+        assert!(layers.wanted() < LAYERS && !layers.is_line_slow());
+        let mut line = Line::new(1);
+        line.run(120);
+        assert!(line.layers.is_line_slow() && !line.layers.is_rig_slow());
+        line.carries = LAYERS;
+        line.run(600);
+        assert!(!line.layers.is_line_slow());
     }
 
     #[test]

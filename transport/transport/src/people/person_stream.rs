@@ -3,20 +3,15 @@
 //! A template is fetched in chunks beside motion, before colours are subscribed to.
 
 use std::{
-    collections::VecDeque,
+    collections::BTreeSet,
     sync::{Arc, Mutex},
     time::{Duration, Instant},
 };
 
 use crossbeam::channel::bounded;
-use flyrig_stream::{LAYERS, MAX_TEMPLATE_BYTES, template_hash};
+use flyrig_stream::LAYERS;
 use prost::bytes::Bytes;
-use zenoh::{
-    Session, Wait,
-    handlers::FifoChannelHandler,
-    qos::{CongestionControl, Priority},
-    query::{Query, Reply},
-};
+use zenoh::{Session, Wait, query::Query};
 
 use crate::{
     drain::PublisherState,
@@ -24,19 +19,17 @@ use crate::{
     header::MessageKind,
     inbox::Inbox,
     keys::{self, MAX_PERSON_TOPICS},
-    people::wake_lag::WakeLag,
+    people::{
+        catch_up::{CatchUp, Missing},
+        chunks::{CHUNK, ask_template},
+        present::PresentPeople,
+        wake_lag::WakeLag,
+    },
     topic::{Topic, lock},
 };
 
-/// Bytes of a template per reply, which fit in one batch of zenoh's, so that a slow line drops no fragments.
-const CHUNK: usize = 60_000;
-/// Chunks under way at once: enough for 20 Mbit/s with 100 ms, and fewer than the places in the sender's queue.
-const AT_ONCE: usize = 6;
 /// Largest number of waiting queries for chunks, over all viewers.
 const MAX_QUERIES: usize = 1024;
-/// Time limit of a chunk.
-const CHUNK_PATIENCE: Duration = Duration::from_secs(5);
-
 /// Message of the person stream, still encoded.
 #[derive(Debug, Clone, PartialEq)]
 pub struct PersonMessage {
@@ -60,6 +53,8 @@ pub(crate) struct PublishedPeople {
     others: Mutex<Vec<(u32, Topics)>>,
     /// Person, hash and bytes of each template, newest last.
     templates: Mutex<Vec<(u32, u64, Bytes)>>,
+    /// Last motion and colours of each person, for viewers that join.
+    pub present: PresentPeople,
 }
 
 fn topics_of(person: u32) -> Topics {
@@ -74,7 +69,8 @@ fn topics_of(person: u32) -> Topics {
 
 impl PublishedPeople {
     pub fn new() -> Self {
-        Self { first: topics_of(0), others: Mutex::default(), templates: Mutex::default() }
+        let present = PresentPeople::default();
+        Self { first: topics_of(0), others: Mutex::default(), templates: Mutex::default(), present }
     }
 
     /// Returns the topics of person 0.
@@ -117,11 +113,23 @@ impl PublishedPeople {
         templates.push((person, hash, bytes));
     }
 
-    /// Returns the reply to a query: size of the template, u32, and a chunk of its bytes.
+    /// Returns the reply to a query; `None` for an unknown one.
+    fn reply(&self, label: &str) -> Option<Vec<u8>> {
+        if label == keys::LAST_MOTIONS {
+            return Some(self.present.motions(Instant::now()));
+        }
+        match keys::whole_colors_in(label) {
+            Some((person, first_layer)) => self.present.colors_hash(person, first_layer, Instant::now()),
+            None => self.chunk(label),
+        }
+    }
+
+    /// Returns the reply to a query for a chunk: size of the template or of the colours, u32, and a part of its bytes.
     fn chunk(&self, label: &str) -> Option<Vec<u8>> {
         let (hash, chunk) = keys::chunk_in(label)?;
-        let bytes =
-            lock(&self.templates).iter().find(|(_, known, _)| *known == hash).map(|(.., bytes)| bytes.clone())?;
+        let template =
+            lock(&self.templates).iter().find(|(_, known, _)| *known == hash).map(|(.., bytes)| bytes.clone());
+        let bytes = template.or_else(|| self.present.colors(hash))?;
         let first = (chunk as usize).checked_mul(CHUNK).filter(|first| *first < bytes.len())?;
         let mut reply = (bytes.len() as u32).to_le_bytes().to_vec();
         reply.extend(&bytes[first..bytes.len().min(first + CHUNK)]);
@@ -143,9 +151,9 @@ pub(crate) fn answer_templates(
     Ok(move |query| drop(queries.try_send(query)))
 }
 
-/// Answers a query for a known template; another publisher may have an unknown one.
+/// Answers a query for a known template or the present state; another publisher may have an unknown one.
 fn answer_template(people: &PublishedPeople, query: &Query) {
-    let Some(reply) = keys::label_in(query.key_expr().as_str()).and_then(|label| people.chunk(label)) else { return };
+    let Some(reply) = keys::label_in(query.key_expr().as_str()).and_then(|label| people.reply(label)) else { return };
     if let Err(error) = query.reply(query.key_expr(), reply).wait() {
         tracing::warn!(%error, "could not answer a request for a template");
     }
@@ -164,12 +172,57 @@ pub(crate) struct PersonSubscription {
     layers: Mutex<Vec<Subscription>>,
     /// Thread that measures scheduling delays, started with motion.
     wake_lag: Mutex<Option<WakeLag>>,
+    /// Thread that fetches what was published before, started with motion.
+    catch_up: Mutex<Option<CatchUp>>,
+    /// People whose templates have arrived.
+    known: Mutex<BTreeSet<u32>>,
+}
+
+impl std::fmt::Debug for PersonSubscription {
+    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+        f.debug_struct("PersonSubscription").field("rig", &self.rig).finish_non_exhaustive()
+    }
 }
 
 impl PersonSubscription {
     pub fn new(session: &Session, rig: &str, inbox: &Arc<Inbox>) -> Self {
         let (session, rig, inbox) = (session.clone(), rig.to_owned(), inbox.clone());
-        Self { session, rig, inbox, motion: Mutex::default(), layers: Mutex::default(), wake_lag: Mutex::default() }
+        Self {
+            session,
+            rig,
+            inbox,
+            motion: Mutex::default(),
+            layers: Mutex::default(),
+            wake_lag: Mutex::default(),
+            catch_up: Mutex::default(),
+            known: Mutex::default(),
+        }
+    }
+
+    /// Fetches the last motions, and the colours of all known people: the rig has appeared, or appeared again.
+    pub fn rig_appeared(&self) {
+        self.miss(Missing::Motions);
+        lock(&self.known).iter().for_each(|person| self.miss(Missing::Colors { person: *person, first_layer: 0 }));
+    }
+
+    /// Fetches the present state of people whose template the reader has taken.
+    pub fn template_taken(&self, people: &[u32]) {
+        if let Some(first) = people.first() {
+            // A motion that came before its template is lost to readers that keep none.
+            self.miss(Missing::Motions);
+            let mut known = lock(&self.known);
+            known.extend(people);
+            while known.len() > MAX_PERSON_TOPICS + 1 && known.first() != Some(first) {
+                known.pop_first();
+            }
+        }
+        people.iter().for_each(|person| self.miss(Missing::Colors { person: *person, first_layer: 0 }));
+    }
+
+    fn miss(&self, missing: Missing) {
+        if let Some(catch_up) = &*lock(&self.catch_up) {
+            catch_up.fetch(missing);
+        }
     }
 
     fn subscribe(&self, part: &str) -> Result<Subscription, TransportError> {
@@ -196,6 +249,11 @@ impl PersonSubscription {
             }
         }
         drop(wake_lag);
+        let mut catch_up = lock(&self.catch_up);
+        if catch_up.is_none() {
+            *catch_up = Some(CatchUp::start(&self.session, &self.rig, &self.inbox)?);
+        }
+        drop(catch_up);
         let mut motion = lock(&self.motion);
         if motion.is_none() {
             *motion = Some(self.subscribe(keys::MOTION)?);
@@ -207,8 +265,9 @@ impl PersonSubscription {
     pub fn follow(&self) {
         let wanted = self.inbox.color_layers();
         let mut layers = lock(&self.layers);
-        if layers.len() != wanted {
-            tracing::debug!(before = layers.len(), wanted, "layers of colours");
+        let before = layers.len();
+        if before != wanted {
+            tracing::debug!(before, wanted, "layers of colours");
         }
         while layers.len() > wanted {
             if let Some(Err(error)) = layers.pop().map(|layer| layer.undeclare().wait()) {
@@ -219,6 +278,16 @@ impl PersonSubscription {
             match self.subscribe(&format!("{}{}", keys::COLOR, layers.len())) {
                 Ok(layer) => layers.push(layer),
                 Err(error) => return tracing::warn!(%error, "colours cannot be received"),
+            }
+        }
+        drop(layers);
+        let missed = self.inbox.take_missed_colors();
+        // A fast rig refreshes everything within a second.
+        if self.inbox.is_rig_slow() {
+            let colors = |person: u32, first_layer: usize| self.miss(Missing::Colors { person, first_layer });
+            missed.into_iter().for_each(|person| colors(person, 0));
+            if wanted > before {
+                lock(&self.known).iter().for_each(|person| colors(*person, before));
             }
         }
     }
@@ -250,58 +319,4 @@ impl PersonSubscription {
         }
         Ok(answer)
     }
-}
-
-/// Fetches a template in chunks, some of them under way at once, and checks its hash.
-fn ask_template(session: &Session, rig: &str, hash: u64, timeout: Duration) -> Result<Option<Vec<u8>>, TransportError> {
-    let deadline = flyrig_types::deadline_after(timeout);
-    let malformed = |problem: String| TransportError::malformed(keys::chunk_label(hash, 0), problem);
-    let ask = |chunk: u32| ask_chunk(session, &keys::key(rig, &keys::chunk_label(hash, chunk)), deadline);
-    let (mut bytes, mut count) = (Vec::new(), 1);
-    let mut under_way = VecDeque::from([ask(0)?]);
-    let mut asked = 1;
-    for chunk in 0.. {
-        let Some(replies) = under_way.pop_front() else { break };
-        let mut part = received(&replies);
-        if part.is_none() && chunk > 0 {
-            // The chunk was dropped on the way.
-            part = received(&ask(chunk)?);
-        }
-        let Some((size, part)) = part else { return Ok(None) };
-        if size > MAX_TEMPLATE_BYTES {
-            return Err(malformed(format!("a template of {size} bytes, at most {MAX_TEMPLATE_BYTES}")));
-        }
-        bytes.extend(part);
-        count = count.max(size.div_ceil(CHUNK) as u32);
-        while asked < count && under_way.len() < AT_ONCE {
-            under_way.push_back(ask(asked)?);
-            asked += 1;
-        }
-    }
-    if template_hash(&bytes) == hash {
-        Ok(Some(bytes))
-    } else {
-        Err(malformed("the answer is another template".to_owned()))
-    }
-}
-
-type Replies = FifoChannelHandler<Reply>;
-
-fn ask_chunk(session: &Session, key: &str, deadline: Instant) -> Result<Replies, TransportError> {
-    let left = deadline.saturating_duration_since(Instant::now()).min(CHUNK_PATIENCE);
-    session
-        .get(key)
-        // The reply inherits both: a stalled subscriber must not block the publisher's session, and motion goes first.
-        .congestion_control(CongestionControl::Drop)
-        .priority(Priority::DataHigh)
-        .timeout(left)
-        .wait()
-        .map_err(|error| TransportError::session(key, &error))
-}
-
-/// Returns the template's size and the bytes of a chunk; `None` when it did not arrive.
-fn received(replies: &Replies) -> Option<(usize, Vec<u8>)> {
-    let payload = replies.recv().ok()?.into_result().ok()?.payload().to_bytes().into_owned();
-    let (size, chunk) = payload.split_first_chunk().filter(|(_, chunk)| chunk.len() <= CHUNK)?;
-    Some((u32::from_le_bytes(*size) as usize, chunk.to_vec()))
 }

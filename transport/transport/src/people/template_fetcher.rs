@@ -38,11 +38,15 @@ pub struct TemplateFetcher {
     kept: VecDeque<(u64, Vec<u8>)>,
     /// People and hashes of kept templates requested since.
     ready: VecDeque<(u32, u64)>,
+    /// Subscription that fetches the colours of people whose templates were taken.
+    people: Option<Arc<PersonSubscription>>,
 }
 
 impl TemplateFetcher {
     pub(crate) fn start(people: Arc<PersonSubscription>) -> Result<Self, TransportError> {
-        Self::with(move |hash| people.ask_template(hash, PATIENCE))
+        let asked = Arc::clone(&people);
+        let fetcher = Self::with(move |hash| asked.ask_template(hash, PATIENCE))?;
+        Ok(Self { people: Some(people), ..fetcher })
     }
 
     fn with(
@@ -71,6 +75,7 @@ impl TemplateFetcher {
             failed: HashMap::new(),
             kept: VecDeque::new(),
             ready: VecDeque::new(),
+            people: None,
         })
     }
 
@@ -103,6 +108,14 @@ impl TemplateFetcher {
     /// # Errors
     /// As [`crate::Subscriber::template`]; the next call of [`Self::ask`] requests the template again.
     pub fn take(&mut self) -> Result<Option<FetchedTemplate>, TransportError> {
+        let taken = self.take_next();
+        if let (Ok(Some(template)), Some(people)) = (&taken, &self.people) {
+            people.template_taken(&template.people);
+        }
+        taken
+    }
+
+    fn take_next(&mut self) -> Result<Option<FetchedTemplate>, TransportError> {
         while let Some((person, hash)) = self.ready.pop_front() {
             if let Some(at) = self.kept.iter().position(|(kept, _)| *kept == hash) {
                 self.kept.make_contiguous()[at..].rotate_left(1);

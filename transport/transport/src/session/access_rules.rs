@@ -70,7 +70,7 @@ pub(crate) fn behind_gate(ring: &Ring, roles: &[Role]) -> Value {
     let alive = [keys::any_version_alive(rig)];
     let watched: Vec<String> =
         ["person/**", "view/*", "stats", "calibration/*", "transforms", "splats", "splats/*"].map(key).to_vec();
-    let templates = [key("template/*")];
+    let templates = [key("template/*"), key("present/*")];
     let all_viewpoints = [key("viewpoint/*")];
     rules.extend([
         rule("watch-to", TO, &["put"], &watched),

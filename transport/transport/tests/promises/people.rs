@@ -1,9 +1,18 @@
 //! The person stream: messages, templates in chunks, and what claims to belong to it.
 
-use std::time::Duration;
+use std::{
+    sync::{Arc, Mutex},
+    time::{Duration, Instant},
+};
 
-use flyrig_stream::{EncodedTemplate, LAYERS, MAX_MESSAGE_BYTES, Stamp, StreamJoint, StreamTemplate, TemplateSource};
-use flyrig_transport::{Interests, MAX_PERSON_TOPICS, PersonMessage, PublishOutcome, Received, Subscriber};
+use flyrig_stream::{
+    ColorDecoder, ColorEncoder, ColorSettings, EncodedTemplate, LAYERS, MAX_MESSAGE_BYTES, Motion, MotionEncoder,
+    Stamp, StreamJoint, StreamTemplate, TemplateSource, WholeColors,
+};
+use flyrig_transport::{
+    Interests, MAX_PERSON_TOPICS, PersonMessage, PublishOutcome, Publisher, Received, Relay, Subscriber,
+    TransportConfig,
+};
 
 use crate::support::*;
 
@@ -134,4 +143,151 @@ fn what_is_too_large_or_names_no_part_is_refused_in_words() {
     assert!(error.to_string().contains("65001 bytes, at most 65000"), "{error}");
     // A layer that does not exist is not sent.
     assert_eq!(publisher.publish_person(&Stamp::default(), Some(LAYERS), vec![0].into()), PublishOutcome::Unwatched);
+}
+
+/// Person who was published once and does not move since: a rig between two of its rare frame sets.
+struct Standing {
+    encoded: EncodedTemplate,
+    colors: Arc<Shared>,
+}
+
+#[derive(Debug)]
+struct Shared(Mutex<ColorEncoder>);
+
+impl WholeColors for Shared {
+    fn whole(&self, first_layer: usize) -> Vec<(usize, Vec<u8>)> {
+        self.0.lock().unwrap().whole(first_layer)
+    }
+}
+
+const GAUSSIANS: usize = 30_000;
+
+fn paint(second: f32) -> Vec<[f32; 4]> {
+    (0..GAUSSIANS).map(|i| [(i % 97) as f32 / 97.0, second, (i % 13) as f32 / 13.0, 1.0]).collect()
+}
+
+impl Standing {
+    /// Publishes a frame set. The byte budget holds a small part of the colours.
+    fn new(publisher: &Publisher) -> Self {
+        let encoded = encoded(GAUSSIANS);
+        let settings = ColorSettings { max_frame_bytes: 4000, ..ColorSettings::default() };
+        let colors = Arc::new(Shared(Mutex::new(ColorEncoder::new(&encoded, settings, 1))));
+        let hash = encoded.template.hash;
+        publisher.offer_template_with(5, hash, encoded.bytes.clone().into(), colors.clone());
+        let standing = Self { encoded, colors };
+        standing.publish(publisher, 0);
+        standing
+    }
+
+    fn publish(&self, publisher: &Publisher, frame: u64) {
+        let template = self.encoded.template.hash;
+        let stamp = Stamp { template, person: 5, frame, capture_nanos: 5_000_000_000 * frame as i64 };
+        let joint_rotations = vec![[0.0, 0.0, 0.0, 1.0]];
+        let motion = Motion { stamp, root_translation: [0.0, 1.0, 0.0], joint_rotations, nodes: Vec::new() };
+        let bytes = MotionEncoder::new(&self.encoded).encode(&motion).unwrap();
+        publisher.publish_person(&stamp, None, bytes.into());
+        let layers = self.colors.0.lock().unwrap().encode(stamp, &paint(0.1 * frame as f32));
+        for (layer, bytes) in layers.into_iter().enumerate() {
+            publisher.publish_person(&stamp, Some(layer), bytes.into());
+        }
+    }
+
+    /// Returns the colours that a decoder ought to have.
+    fn expected(&self) -> Vec<[f32; 4]> {
+        let mut decoder = ColorDecoder::new(&self.encoded.template);
+        for (_, message) in self.colors.whole(0) {
+            decoder.ingest(&message).unwrap();
+        }
+        let mut colors = Vec::new();
+        decoder.colors(&mut colors);
+        colors
+    }
+}
+
+/// Reads as viewers do until all colours are those of `standing`.
+fn watch_until_whole(subscriber: &Subscriber, standing: &Standing) -> u64 {
+    let mut templates = subscriber.template_fetcher().unwrap();
+    let (mut decoder, mut motions) = (None, 0);
+    let end = Instant::now() + PATIENCE;
+    loop {
+        assert!(Instant::now() < end, "waited in vain for colours, {motions} motions came");
+        if let Some(fetched) = templates.take().unwrap() {
+            decoder = Some(ColorDecoder::new(&StreamTemplate::decode(&fetched.bytes).unwrap()));
+        }
+        let Some(received) = subscriber.next_person(Duration::from_millis(20)).unwrap() else { continue };
+        if received.body.layer.is_none() {
+            motions += 1;
+            if decoder.is_none() {
+                templates.ask(received.body.person, standing.encoded.template.hash);
+            }
+        } else if let Some(decoder) = &mut decoder {
+            decoder.ingest(&received.body.bytes).unwrap();
+            if (0..LAYERS).all(|layer| decoder.known(layer) >= 1.0) {
+                let mut colors = Vec::new();
+                decoder.colors(&mut colors);
+                assert!(colors == standing.expected());
+                return motions;
+            }
+        }
+    }
+}
+
+#[test]
+fn a_viewer_that_joins_between_two_rare_frame_sets_gets_the_person_whole() {
+    let publisher = open_publisher(|_| {});
+    let standing = Standing::new(&publisher);
+    // Nothing is published from here on, and nobody was subscribed before.
+    for _ in 0..2 {
+        let subscriber = open_subscriber(&publisher, &people());
+        assert!(watch_until_whole(&subscriber, &standing) >= 1);
+        assert!(!subscriber.is_line_slow());
+    }
+}
+
+#[test]
+fn a_viewer_of_a_relay_gets_the_person_whole_as_well() {
+    let publisher = open_publisher(|_| {});
+    publisher.set_calibration(&rig()).unwrap();
+    let standing = Standing::new(&publisher);
+    let from = subscriber_config(publisher.endpoints());
+    let to = TransportConfig { listen: vec![free_endpoint()], ..TransportConfig::publisher("test") };
+    let relay = Relay::start(&from, &to).unwrap();
+    let subscriber = Subscriber::open(&subscriber_config(&to.listen), &people()).unwrap();
+    watch_until_whole(&subscriber, &standing);
+    assert!(relay.trouble().is_none());
+}
+
+#[test]
+fn a_viewer_that_misses_changes_of_a_slow_rig_gets_the_present_colours() {
+    let publisher = open_publisher(|_| {});
+    let standing = Standing::new(&publisher);
+    let subscriber = open_subscriber(&publisher, &people());
+    watch_until_whole(&subscriber, &standing);
+    wait_until("all layers", || {
+        let _ = subscriber.next_person(Duration::from_millis(20));
+        subscriber.color_layers() == LAYERS
+    });
+    // Two sets of which the reader sees the second alone: the first one's changes are replaced in its inbox.
+    for frame in 1..3 {
+        wait_until("subscriptions to all layers", || {
+            let watched = publisher.counts();
+            (0..LAYERS).all(|layer| {
+                watched.iter().any(|(label, counts)| *label == format!("person/5/color-{layer}") && counts.watched)
+            })
+        });
+        standing.publish(&publisher, frame);
+        std::thread::sleep(Duration::from_millis(300));
+    }
+    let mut decoder = ColorDecoder::new(&standing.encoded.template);
+    wait_until("the present colours", || {
+        if let Some(received) = subscriber.next_person(Duration::from_millis(20)).unwrap()
+            && received.body.layer.is_some()
+        {
+            decoder.ingest(&received.body.bytes).unwrap();
+        }
+        (0..LAYERS).all(|layer| decoder.known(layer) >= 1.0)
+    });
+    let mut colors = Vec::new();
+    decoder.colors(&mut colors);
+    assert!(colors == standing.expected());
 }

@@ -254,6 +254,10 @@ impl Perception for EstimatedPerception {
         }
     }
 
+    fn is_measuring(&self) -> bool {
+        self.places.iter().any(PersonPlace::is_being_measured)
+    }
+
     fn people(&self) -> Vec<KnownPerson<'_>> {
         self.places.iter().filter(|place| place.is_known).map(PersonPlace::known_person).collect()
     }

@@ -94,6 +94,11 @@ impl PersonPlace {
         self.estimator.sets_lost() > 0
     }
 
+    /// Returns whether a person is seen here whose shape is not known yet.
+    pub fn is_being_measured(&self) -> bool {
+        !self.is_known && self.seen > 0 && self.missing_since.is_none()
+    }
+
     /// Returns the person as the session knows it.
     pub fn known_person(&self) -> KnownPerson<'_> {
         KnownPerson {
