@@ -1,10 +1,15 @@
 //! Input images with the outlines of mask and rendered person, which show whether masks, pose and calibration fit.
 
-use anyhow::Result;
+use anyhow::{Result, ensure};
+use flyrig_capture::to_rgb8;
 use flyrig_fusion::{PersonId, Session};
+use flyrig_metrics::person_box;
+use flyrig_types::{Frame, Mask, RenderedView};
 
 use crate::png;
 
+/// Margin around the person in a cropped image, pixels.
+const MARGIN_PX: u32 = 24;
 /// Colour of the mask's outline.
 const MASK: [u8; 3] = [0, 255, 80];
 /// Colour of the rendered person's outline.
@@ -30,6 +35,30 @@ pub fn outlined_inputs(session: &mut Session, person: PersonId) -> Result<Vec<(S
         out.push((caption, png::encode_rgb(&rgb, drawn.width, drawn.height)?));
     }
     Ok(out)
+}
+
+/// Encodes a held-out image as a captioned PNG image, cropped to the person, with the outlines of its mask, if there is one, and of the
+/// rendered view. `None` where the view shows nobody.
+///
+/// # Errors
+/// The image cannot be read, or sizes differ.
+pub fn outlined_view(view: &RenderedView, truth: &Frame, mask: Option<&Mask>) -> Result<Option<(String, Vec<u8>)>> {
+    let (width, height) = (view.width as usize, view.height as usize);
+    let mut rgb = to_rgb8(&truth.image)?;
+    let alpha = |rgba: &[u8]| rgba.chunks_exact(4).map(|pixel| pixel[3]).collect::<Vec<u8>>();
+    let silhouette = Mask::new(view.width, view.height, alpha(&view.rgba))?;
+    let Ok([left, top, right, bottom]) = person_box(&silhouette, MARGIN_PX) else { return Ok(None) };
+    ensure!(rgb.len() == 3 * width * height, "camera {}: image and view differ in size", truth.camera);
+    let mut caption = format!("held-out {}: ours magenta", truth.camera);
+    if let Some(mask) = mask.filter(|mask| (mask.width(), mask.height()) == (view.width, view.height)) {
+        let rgba: Vec<u8> = mask.coverage().iter().flat_map(|&a| [0, 0, 0, a]).collect();
+        paint_outline(&mut rgb, &rgba, width, height, MASK);
+        caption = format!("held-out {}: mask green, ours magenta", truth.camera);
+    }
+    paint_outline(&mut rgb, &view.rgba, width, height, DRAWN);
+    let row = |y: usize| &rgb[3 * (y * width + left as usize)..3 * (y * width + right as usize)];
+    let cut: Vec<u8> = (top as usize..bottom as usize).flat_map(row).copied().collect();
+    Ok(Some((caption, png::encode_rgb(&cut, right - left, bottom - top)?)))
 }
 
 /// Paints the pixels of `rgb` whose alpha in `rgba` is at least 128 while that of a neighbour is not.
