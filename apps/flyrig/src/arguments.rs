@@ -173,13 +173,6 @@ impl LagArgs {
         self.by_camera.iter().map(|(camera, _)| camera.clone()).collect()
     }
 
-    /// Returns the offsets of these cameras, nanoseconds.
-    pub fn nanos_of<'a>(&self, cameras: impl Iterator<Item = &'a String> + Clone) -> BTreeMap<CameraId, i64> {
-        let mut nanos = self.nanos();
-        nanos.retain(|id, _| cameras.clone().any(|camera| camera == id.as_str()));
-        nanos
-    }
-
     /// Returns the offsets to subtract from the timestamps, nanoseconds.
     pub fn nanos(&self) -> BTreeMap<CameraId, i64> {
         self.by_camera.iter().map(|(camera, ms)| (camera.as_str().into(), (ms * 1e6).round() as i64)).collect()

@@ -5,6 +5,7 @@ use std::path::PathBuf;
 use clap::Args;
 use flyrig_fusion::{AppearanceOptions, BodySettings, BudgetSettings, SessionSettings};
 use flyrig_takes::{KnownBody, ReplaySettings};
+use flyrig_types::CameraId;
 
 use super::plan::Split;
 use crate::arguments::{DatasetArgs, HoldoutArgs};
@@ -49,6 +50,11 @@ impl EvalArgs {
 
     /// Returns the settings of the reconstruction of a split.
     pub fn replay(&self, split: &Split, known: Option<KnownBody>) -> ReplaySettings {
+        let mut lags_nanos = self.take.lags.nanos();
+        // A camera that this split does not read; one of another name is an error.
+        let has = |names: &[String], id: &CameraId| names.iter().any(|name| name == id.as_str());
+        let is_read = |id: &CameraId| has(&split.inputs, id) || has(&split.holdout, id);
+        lags_nanos.retain(|id, _| is_read(id) || !has(&self.take.inputs, id));
         ReplaySettings {
             dataset: self.take.dataset.clone(),
             inputs: split.inputs.clone(),
@@ -62,7 +68,7 @@ impl EvalArgs {
             },
             fps: self.take.rate.fps,
             frames: self.take.range.frames.clone(),
-            lags_nanos: self.take.lags.nanos_of(split.inputs.iter().chain(&split.holdout)),
+            lags_nanos,
             true_masks: false,
             true_joints: Vec::new(),
             body: known,
