@@ -116,16 +116,13 @@ fn a_camera_that_looks_beside_is_named_with_its_remedy() {
         let verdicts = metrics["verdicts"].as_array().unwrap();
         verdicts.iter().find(|verdict| verdict["camera"] == camera).unwrap().clone()
     };
-    let (moved, still) = (verdict("03"), verdict("00"));
+    let moved = verdict("03");
     assert!((4.0..8.0).contains(&moved["outline_px"].as_f64().unwrap()), "{moved}");
     assert_eq!(moved["grade"], "bad");
-    assert!(still["outline_px"].as_f64().unwrap() < 3.0, "{still}");
     let html = read(&data, "beside/index.html");
+    assert!(html.contains("03 disturbs the others: without it their outlines are"), "{}", finished.stdout);
     let next = html.split("Next: ").nth(1).unwrap().split('<').next().unwrap();
-    assert!(
-        next.starts_with("the outline of 03 is 6 px beside") && next.contains("flyrig calibrate person data"),
-        "{next}"
-    );
+    assert!(next.starts_with("the outline of 03 is ") && next.contains("flyrig calibrate person data"), "{next}");
 }
 
 #[test]

@@ -49,7 +49,7 @@ pub fn eval(args: &EvalArgs, gpu: &GpuContext) -> Result<()> {
         println!("{}", evaluation.sheet.table());
     }
     println!("{}", first.replay.session.stages.table());
-    metrics.sentences(args, &plan).iter().for_each(|sentence| println!("{sentence}"));
+    metrics.sentences(args, &plan, &evaluation).iter().for_each(|sentence| println!("{sentence}"));
     println!(
         "\n{} frames in {seconds:.1} s; open {} and take.html beside it in a browser",
         first.processed,

@@ -1,9 +1,11 @@
 //! Agreement of one camera with the reconstruction: outline and brightness, and the words about it.
 
+use std::collections::BTreeMap;
+
 use anyhow::Result;
 use flyrig_capture::to_rgb8;
 use flyrig_metrics::CameraScore;
-use flyrig_types::{Image, Mask, RenderedView};
+use flyrig_types::{CameraId, Image, Mask, RenderedView};
 use serde::Serialize;
 
 /// Coverage from which a pixel belongs to the person.
@@ -18,6 +20,10 @@ const OUTLINE_BAD: f64 = 0.02;
 /// to 18 dB, with torn hands and legs.
 const PSNR_GOOD_DB: f64 = 22.0;
 const PSNR_BAD_DB: f64 = 19.0;
+/// The same among the input views of one reconstruction, beyond which they contradict each other, and the share of it below which a camera
+/// less makes them agree.
+const INNER_GOOD: f64 = 0.004;
+const CLEARLY: f64 = 0.6;
 /// Difference in brightness that shows as a seam on skin, relative.
 const LIGHT_GOOD: f64 = 0.1;
 const LIGHT_BAD: f64 = 0.2;
@@ -100,9 +106,14 @@ impl CameraCheck {
         }
     }
 
+    /// Returns the median distance of our outlines from those of the masks, relative to the person's height.
+    fn share(&self) -> Option<f64> {
+        median(self.offsets.iter().map(|offset| length(offset.by) / offset.height))
+    }
+
     /// Forms the verdict, with the score of the camera's held-out images, if any.
     pub fn verdict(&self, camera: &str, score: Option<&CameraScore>) -> Verdict {
-        let shares = median(self.offsets.iter().map(|offset| length(offset.by) / offset.height));
+        let shares = self.share();
         let outline_px = median(self.offsets.iter().map(|offset| length(offset.by)));
         let light = (self.light[1] > 0.0 && score.is_some()).then(|| self.light[0] / self.light[1]);
         let outline = graded(shares.unwrap_or(0.0), OUTLINE_GOOD, OUTLINE_BAD);
@@ -163,13 +174,44 @@ impl CameraCheck {
     }
 }
 
+/// Camera that disturbs the others: without it, their outlines fit.
+#[derive(Debug, PartialEq)]
+pub struct Culprit {
+    pub camera: CameraId,
+    /// Distance of the other cameras' outlines without it, and in the median of the other reconstructions, relative to the person's height.
+    shares: [f64; 2],
+}
+
+impl Culprit {
+    /// Finds the camera by the comparisons of the input views in each reconstruction, by the camera that it leaves out. A wrong camera is
+    /// predicted wrongly, but it also makes the others' predictions wrong; only without it do the rest agree.
+    pub fn find(without: &BTreeMap<CameraId, CameraCheck>) -> Option<Self> {
+        let shares = without.iter().filter_map(|(camera, check)| Some((camera, check.share()?)));
+        let (camera, least) = shares.clone().min_by(|a, b| a.1.total_cmp(&b.1))?;
+        let others = median(shares.filter(|(other, _)| *other != camera).map(|(_, share)| share))?;
+        let is_clear = others > INNER_GOOD && least < CLEARLY * others;
+        is_clear.then(|| Self { camera: camera.clone(), shares: [least, others] })
+    }
+
+    /// Explains the finding.
+    pub fn words(&self) -> String {
+        let Self { camera, shares: [without, with] } = self;
+        format!(
+            "{camera} disturbs the others: without it their outlines are {:.1} % of the person's height beside, with it {:.1} %.",
+            100.0 * without,
+            100.0 * with
+        )
+    }
+}
+
 impl Verdict {
-    /// Names the next step for the camera that needs one most; `None` if all are good.
-    pub fn next_step(verdicts: &[Self], take: &str) -> Option<String> {
+    /// Names the next step for the camera that needs one most, which is the culprit if there is one; `None` if all are good.
+    pub fn next_step(verdicts: &[Self], culprit: Option<&Culprit>, take: &str) -> Option<String> {
+        let is_culprit = |verdict: &Self| culprit.is_some_and(|found| found.camera.as_str() == verdict.camera);
         let worst = verdicts.iter().filter(|verdict| verdict.grade > Grade::Good).max_by(|a, b| {
-            let key = |verdict: &Self| (verdict.grade, verdict.outline_share.unwrap_or(0.0));
-            let (a, b) = (key(a), key(b));
-            a.0.cmp(&b.0).then(a.1.total_cmp(&b.1))
+            let key = |verdict: &Self| (is_culprit(verdict), verdict.grade);
+            let share = |verdict: &Self| verdict.outline_share.unwrap_or(0.0);
+            key(a).cmp(&key(b)).then(share(a).total_cmp(&share(b)))
         })?;
         let name = &worst.camera;
         if let Some(px) = worst.outline_px.filter(|_| worst.outline_share > Some(OUTLINE_GOOD)) {
@@ -318,7 +360,7 @@ mod tests {
         let verdict = check(2, 100, |_| [0, 0]).verdict("03", Some(&score(25.0)));
         assert_eq!((verdict.grade, verdict.outline_px), (Grade::Good, Some(0.0)));
         assert!(verdict.words.starts_with("Camera 03 is good: 25.0 dB when held out"), "{}", verdict.words);
-        assert_eq!(Verdict::next_step(&[verdict], "take"), None);
+        assert_eq!(Verdict::next_step(&[verdict], None, "take"), None);
     }
 
     #[test]
@@ -326,15 +368,33 @@ mod tests {
         let moved = check(4, 100, |_| [-3, 2]).verdict("03", None);
         assert_eq!((moved.grade, moved.follows_motion), (Grade::Bad, false));
         assert!((moved.outline_px.unwrap() - 13f64.sqrt()).abs() < 1e-9, "{moved:?}");
-        let step = Verdict::next_step(&[moved.clone()], "take").unwrap();
+        let step = Verdict::next_step(std::slice::from_ref(&moved), None, "take").unwrap();
         assert!(step.contains("the outline of 03 is 4 px beside") && step.contains("calibrate person take"), "{step}");
         // Ours is half a frame ahead, forth and back.
         let late = check(4, 100, |frame| [if frame <= 3 { 2 } else { -2 }, 0]).verdict("03", None);
         assert!(late.follows_motion && late.grade == Grade::Bad, "{late:?}");
         // The worst camera is named.
         let slight = check(4, 100, |_| [1, 0]).verdict("04", None);
-        let step = Verdict::next_step(&[slight, late], "take").unwrap();
+        let step = Verdict::next_step(&[slight, late], None, "take").unwrap();
         assert!(step.contains("of 03 is 2 px") && step.contains("sync-check take"), "{step}");
+    }
+
+    #[test]
+    fn the_camera_without_which_the_others_agree_is_named_first() {
+        let off = |px: i64| check(0, 100, move |_| [px, 0]);
+        let without = |px: [i64; 3]| {
+            let names = ["00", "01", "02"].map(CameraId::from);
+            names.into_iter().zip(px.map(off)).collect::<BTreeMap<CameraId, CameraCheck>>()
+        };
+        let found = Culprit::find(&without([2, 0, 3])).unwrap();
+        assert_eq!(found.camera.as_str(), "01");
+        assert!(found.words().starts_with("01 disturbs the others: without it"), "{}", found.words());
+        // Another camera looks worse, because the culprit took part.
+        let verdicts = [off(5).verdict("00", None), off(3).verdict("01", None)];
+        let step = Verdict::next_step(&verdicts, Some(&found), "take").unwrap();
+        assert!(step.contains("the outline of 01 is 3 px"), "{step}");
+        assert_eq!(Culprit::find(&without([0, 0, 0])), None);
+        assert_eq!(Culprit::find(&without([2, 2, 2])), None);
     }
 
     #[test]
@@ -342,10 +402,12 @@ mod tests {
         let dark = check(0, 75, |_| [0, 0]).verdict("02", Some(&score(23.0)));
         assert_eq!(dark.grade, Grade::Bad);
         assert!(dark.words.contains("47 % darker"), "{}", dark.words);
-        assert!(Verdict::next_step(&[dark], "take").unwrap().contains("02 is too dark: flyrig calibrate color take"));
+        assert!(
+            Verdict::next_step(&[dark], None, "take").unwrap().contains("02 is too dark: flyrig calibrate color take")
+        );
         let poor = check(0, 100, |_| [0, 0]).verdict("02", Some(&score(17.0)));
         assert_eq!(poor.grade, Grade::Bad);
-        assert!(Verdict::next_step(&[poor], "take").unwrap().contains("predicted poorly"));
+        assert!(Verdict::next_step(&[poor], None, "take").unwrap().contains("predicted poorly"));
     }
 
     #[test]

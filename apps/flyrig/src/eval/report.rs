@@ -8,7 +8,7 @@ use serde::Serialize;
 
 use super::{
     arguments::EvalArgs,
-    checks::Verdict,
+    checks::{Culprit, Verdict},
     plan::Plan,
     run::{Evaluation, Run},
 };
@@ -82,7 +82,7 @@ impl<'a> Metrics<'a> {
     }
 
     /// Returns the sentences about the take: what was done, each camera, and the next step.
-    pub fn sentences(&self, args: &EvalArgs, plan: &Plan) -> Vec<String> {
+    pub fn sentences(&self, args: &EvalArgs, plan: &Plan, evaluation: &Evaluation) -> Vec<String> {
         let mut sentences = Vec::new();
         if let Some(mean) = &self.mean {
             sentences.push(format!(
@@ -92,7 +92,13 @@ impl<'a> Metrics<'a> {
         }
         sentences.push(plan.method.clone());
         sentences.extend(self.verdicts.iter().map(|verdict| verdict.words.clone()));
-        sentences.extend(Verdict::next_step(&self.verdicts, &args.take.dataset.display().to_string()));
+        let culprit = Culprit::find(&evaluation.without);
+        sentences.extend(culprit.as_ref().map(Culprit::words));
+        sentences.extend(Verdict::next_step(
+            &self.verdicts,
+            culprit.as_ref(),
+            &args.take.dataset.display().to_string(),
+        ));
         sentences
     }
 
@@ -115,7 +121,7 @@ impl<'a> Metrics<'a> {
             ("frames", format!("{} in {:.1} s, writing and scoring included", self.frames, self.seconds)),
             ("scored against", self.reference.to_owned()),
         ];
-        let mut sentences = self.sentences(args, plan);
+        let mut sentences = self.sentences(args, plan, evaluation);
         let mut links = vec![("Play the take in 3D".to_owned(), "take.html".to_owned())];
         if let Some(film) = args.orbit.as_ref().filter(|film| film.parent() == Some(&args.out)) {
             let name = film.file_name().map_or_else(String::new, |name| name.to_string_lossy().into_owned());

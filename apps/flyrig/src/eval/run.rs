@@ -61,6 +61,8 @@ pub struct Evaluation {
     pub sheet: ScoreSheet,
     /// Comparison of each camera that is held out; of the inputs, if none is held out in turn.
     pub checks: BTreeMap<CameraId, CameraCheck>,
+    /// Comparisons of the input views in the reconstruction without each camera that is held out in turn.
+    pub without: BTreeMap<CameraId, CameraCheck>,
     /// Rows of the contact sheet.
     pub contact: Vec<ContactRow>,
     /// Capture time and mask of each image of the first run's last frame set, nanoseconds.
@@ -77,6 +79,7 @@ impl Evaluation {
             total: first.map_or(0, |run| run.replay.count as u64),
             sheet: ScoreSheet::default(),
             checks: BTreeMap::new(),
+            without: BTreeMap::new(),
             contact: Vec::new(),
             masks: BTreeMap::new(),
         }
@@ -127,6 +130,13 @@ impl Evaluation {
             shown.add(&mut run.replay.session, set)?;
             self.step_first(&mut run.replay.session, set, row)?;
         }
+        if let ([held], true) = (run.replay.holdout.as_slice(), self.in_turn > 0 && number.is_multiple_of(CHECK_EVERY))
+        {
+            let check = self.without.entry(held.id.clone()).or_default();
+            check_inputs(&mut run.replay.session, |_, view, rgb, mask| {
+                check.compare(set.master_nanos, view, rgb, mask);
+            })?;
+        }
         let is_turn = |row: &u64| self.in_turn == 0 || row % self.in_turn + 1 == index as u64;
         self.score_set(&mut run.replay, set.master_nanos, number, row.filter(is_turn))?;
         run.processed += 1;
@@ -149,7 +159,10 @@ impl Evaluation {
         if self.in_turn > 0 {
             self.keep_masks(session, set)?;
         } else if number.is_multiple_of(CHECK_EVERY) {
-            self.check_inputs(session, set.master_nanos)?;
+            let checks = &mut self.checks;
+            check_inputs(session, |camera, view, rgb, mask| {
+                checks.entry(camera).or_default().compare(set.master_nanos, view, rgb, mask);
+            })?;
         }
         let every = (self.in_turn / CONTACT_ROWS).max(1);
         if row.is_some_and(|row| row.is_multiple_of(every)) {
@@ -170,19 +183,6 @@ impl Evaluation {
             if let Some((_, frame)) = frame.filter(|_| alpha.len() == width as usize * height as usize) {
                 self.masks.insert(camera.id.clone(), (frame.capture_nanos, Mask::new(width, height, alpha)?));
             }
-        }
-        Ok(())
-    }
-
-    /// Compares the outlines of the input views with their masks.
-    fn check_inputs(&mut self, session: &mut Session, nanos: i64) -> Result<()> {
-        let person = PersonId::default();
-        for (view, camera) in session.viewed(person).into_iter().enumerate() {
-            let drawn = session.render(&camera)?;
-            let Some(seen) = session.subject(person).map(|subject| subject.input(view)) else { continue };
-            let rgb: Vec<u8> = seen.chunks_exact(4).flat_map(|pixel| [pixel[0], pixel[1], pixel[2]]).collect();
-            let mask: Vec<u8> = seen.chunks_exact(4).map(|pixel| pixel[3]).collect();
-            self.checks.entry(camera.id).or_default().compare(nanos, &drawn, &rgb, &mask);
         }
         Ok(())
     }
@@ -231,6 +231,19 @@ impl Evaluation {
         let path = self.out.join(format!("surface/{number:06}.ply"));
         Ok(write_mesh_ply(&path, &positions, &normals, &subject.template().triangles, &[])?)
     }
+}
+
+/// Compares the outlines of the input views with their masks: `compare` gets camera, view, sRGB pixels and coverage.
+fn check_inputs(session: &mut Session, mut compare: impl FnMut(CameraId, &RenderedView, &[u8], &[u8])) -> Result<()> {
+    let person = PersonId::default();
+    for (view, camera) in session.viewed(person).into_iter().enumerate() {
+        let drawn = session.render(&camera)?;
+        let Some(seen) = session.subject(person).map(|subject| subject.input(view)) else { continue };
+        let rgb: Vec<u8> = seen.chunks_exact(4).flat_map(|pixel| [pixel[0], pixel[1], pixel[2]]).collect();
+        let mask: Vec<u8> = seen.chunks_exact(4).map(|pixel| pixel[3]).collect();
+        compare(camera.id, &drawn, &rgb, &mask);
+    }
+    Ok(())
 }
 
 /// Bar of progress, or lines where there is no terminal.
