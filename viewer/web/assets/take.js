@@ -3,7 +3,8 @@ const RIG = 0, TEMPLATE = 1, MOTION = 2, COLORS = 3;
 const BACKGROUND = [27 / 255, 29 / 255, 32 / 255];
 const REFRESH_SECS = 1.05; // every part of the colours comes again within this time
 const BEFORE_SECS = 1; // motions that are read before the instant shown, to interpolate
-const FILLS = 0.8; // share of the view's height that the person takes at the start
+const FILLS = 0.74; // share of the view's height that the person takes at the start
+const ABOVE = 0.015; // of the middle, because of the bar below
 
 const [canvas, play, time, clock, trouble] = ["view", "play", "time", "clock", "trouble"].map(id => document.getElementById(id));
 const text = new TextDecoder();
@@ -107,7 +108,7 @@ function frame() {
       left = Math.min(left, u); right = Math.max(right, u); top = Math.min(top, v); bottom = Math.max(bottom, v);
     }
     if (!(right > left && bottom > top)) return;
-    wasm.shift((width / 2 - (left + right) / 2) / height, (height / 2 - (top + bottom) / 2) / height);
+    wasm.shift((width / 2 - (left + right) / 2) / height, (height / 2 - (top + bottom) / 2) / height - ABOVE);
     wasm.zoom(FILLS / Math.max((bottom - top) / height, (right - left) / width));
   }
   dirty = true;
