@@ -36,7 +36,6 @@ pub fn eval(args: &EvalArgs, gpu: &GpuContext) -> Result<()> {
     evaluation.run(&mut runs, &mut shown)?;
     let none = || format!("no frame of {} could be used; run with -v to see why", args.take.dataset.display());
     let first = runs.first_mut().filter(|run| run.processed > 0).with_context(none)?;
-    shown.finish(&mut first.replay.session, &args.out.join("take.html"))?;
     let mut contact = std::mem::take(&mut evaluation.contact);
     contact.retain(|row| !row.pictures.is_empty());
     let seconds = started.elapsed().as_secs_f64();
@@ -45,6 +44,7 @@ pub fn eval(args: &EvalArgs, gpu: &GpuContext) -> Result<()> {
     let mut report = metrics.report(args, &plan, &evaluation, contact);
     report.facts.extend(first.replay.session.upright_fault().map(|fault| ("up".to_owned(), fault)));
     report.save(&args.out.join("index.html"))?;
+    shown.finish(&mut first.replay.session, &args.out.join("take.html"))?;
     if !evaluation.sheet.frames().is_empty() {
         println!("{}", evaluation.sheet.table());
     }
