@@ -480,3 +480,75 @@ fn a_page_without_a_rig_says_so_and_is_dragged_through_its_message() {
     browser.call("Runtime.evaluate", &json!({ "expression": "document.execCommand('selectAll')" }));
     assert_eq!(browser.text("getSelection().toString()").trim(), "");
 }
+
+/// Returns the pixels of a screenshot that differ from the background, and a checksum of the image.
+fn shown(browser: &mut Browser) -> (usize, u64) {
+    let answer = browser.call("Page.captureScreenshot", &json!({ "format": "png" }));
+    let bytes = base64::engine::general_purpose::STANDARD.decode(answer["data"].as_str().unwrap()).unwrap();
+    let image = image::load_from_memory(&bytes).unwrap().into_rgb8();
+    if let Ok(out) = std::env::var("FLYRIG_TEST_OUT") {
+        image.save(format!("{out}/take.png")).unwrap();
+    }
+    // Without the bar and the title.
+    let person = image.enumerate_pixels().filter(|(_, y, pixel)| {
+        (60..440).contains(y) && pixel.0.iter().zip(BACKGROUND).any(|(value, grey)| value.abs_diff(grey) > 8)
+    });
+    let sum = image.as_raw().iter().fold(0u64, |sum, value| sum.wrapping_mul(31).wrapping_add(u64::from(*value)));
+    (person.count(), sum)
+}
+
+#[test]
+#[ignore = "needs Chromium; make test-browser"]
+fn the_page_of_a_take_plays_from_the_file_system() {
+    let data = write_dataset().unwrap();
+    let folder = data.root.parent().unwrap();
+    let args = ["eval", "data", "--inputs", "00,02,05", "--gaussians", "12000", "--nodes", "200"];
+    let evaluated = run(PROGRAM, &args, folder).unwrap();
+    assert_eq!(evaluated.code, Some(0), "{evaluated:?}");
+    let page = folder.join("out/eval/take.html");
+    let alone = tempfile::tempdir().unwrap();
+    // Nothing but the one file is there.
+    std::fs::copy(&page, alone.path().join("take.html")).unwrap();
+    let port = std::net::TcpListener::bind("127.0.0.1:0").unwrap().local_addr().unwrap().port();
+    let url = format!("file://{}/take.html", alone.path().display());
+    let mut browser = Browser::open(&url, folder, port, WEBGL2);
+    let size = json!({ "width": SIDE, "height": SIDE, "deviceScaleFactor": 1, "mobile": false });
+    browser.call("Emulation.setDeviceMetricsOverride", &size);
+    wait_until("the person with all colours", || browser.evaluate("document.documentElement.dataset.ready") == "yes");
+    let seek = |browser: &mut Browser, seconds: f64| {
+        browser.evaluate(&format!("time.value = {seconds}; time.dispatchEvent(new Event('input'))"));
+        std::thread::sleep(Duration::from_millis(700));
+        browser.evaluate(SHOWN_FRAME).as_u64().unwrap()
+    };
+    assert_eq!(seek(&mut browser, 1.0), 5, "the last frame");
+    let (count, last) = shown(&mut browser);
+    assert!(count > 10_000, "the person fills the page: {count} pixels");
+    // Back and forth: each instant looks as before, and is complete.
+    assert_eq!(seek(&mut browser, 0.0), 0);
+    assert_ne!(shown(&mut browser).1, last);
+    assert_eq!(browser.evaluate("document.documentElement.dataset.ready"), "yes");
+    let again = (seek(&mut browser, 1.0), shown(&mut browser).1);
+    assert_eq!(again, (5, last));
+
+    // A drag from the centre turns and selects nothing; R resets; the wheel cannot lose the person.
+    let mouse = |browser: &mut Browser, kind: &str, x: u32, more: Value| {
+        let mut parameters = json!({ "type": kind, "x": x, "y": 250, "button": "left", "buttons": 1, "clickCount": 1 });
+        parameters.as_object_mut().unwrap().extend(more.as_object().unwrap().clone());
+        browser.call("Input.dispatchMouseEvent", &parameters);
+    };
+    mouse(&mut browser, "mousePressed", 256, json!({}));
+    mouse(&mut browser, "mouseMoved", 400, json!({}));
+    mouse(&mut browser, "mouseReleased", 400, json!({}));
+    std::thread::sleep(Duration::from_millis(300));
+    assert_ne!(shown(&mut browser).1, last, "it turned");
+    assert_eq!(browser.evaluate("getSelection().toString()"), "");
+    mouse(&mut browser, "mouseWheel", 256, json!({ "deltaX": 0, "deltaY": 10_000, "buttons": 0 }));
+    std::thread::sleep(Duration::from_millis(300));
+    assert!(shown(&mut browser).0 > 1000, "one turn of the wheel is one step");
+    for kind in ["keyDown", "keyUp"] {
+        browser.call("Input.dispatchKeyEvent", &json!({ "type": kind, "code": "KeyR", "key": "r" }));
+    }
+    std::thread::sleep(Duration::from_millis(300));
+    let reset = shown(&mut browser).0;
+    assert!(reset.abs_diff(count) < count / 8, "{reset} pixels, {count} at the start");
+}

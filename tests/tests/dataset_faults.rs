@@ -113,7 +113,7 @@ fn other_mistakes_are_reported_in_one_line() {
     let both = eval(&data, &["--holdout", "02"]);
     assert_ne!(both.code, Some(0));
     std::fs::remove_file(data.root.join("subject.glb")).unwrap();
-    let finished = eval(&data, &[]);
+    let finished = eval(&data, &["--pose", "given"]);
     assert_refused(&data, &finished, "--pose given needs one skinned glTF file");
     let finished = eval(&data, &["--frames", "5..2"]);
     assert_eq!(finished.code, Some(2), "clap's own refusal: {}", finished.stderr);

@@ -7,6 +7,7 @@ use std::time::{Duration, Instant};
 
 use flyrig_gpu::{AdapterChoice, GpuContext};
 use flyrig_stream::Posed;
+use flyrig_tests::run;
 use flyrig_transport::{Interests, Subscriber, TransportConfig, Views};
 use flyrig_viewer::{PeopleScene, Receiver, clock_secs};
 use support::{PATIENCE, Process, SMALL_SIM, small_rig, wait_until};
@@ -89,6 +90,11 @@ fn a_viewer_draws_the_person_as_the_rig_does_live_and_from_a_recording() {
     assert!(record.0.wait().unwrap().success());
     drop(receiver);
 
+    // The recording becomes a film without a rig.
+    let filmed = run(PROGRAM, &["play", "take.mcap", "--orbit", "film.mp4"], folder.path()).unwrap();
+    assert_eq!(filmed.code, Some(0), "{filmed:?}");
+    assert!(filmed.stderr.contains("the film is film.mp4"), "{}", filmed.stderr);
+    assert!(std::fs::metadata(folder.path().join("film.mp4")).unwrap().len() > 50_000);
     // Another rig plays the same person from the file.
     let port = std::net::TcpListener::bind("127.0.0.1:0").unwrap().local_addr().unwrap().port();
     let endpoint = format!("tcp/127.0.0.1:{port}");

@@ -5,14 +5,17 @@ use std::{collections::BTreeMap, path::PathBuf};
 use anyhow::{Result, ensure};
 use clap::Args;
 use flyrig_access::{KeyFile, Role};
-use flyrig_fusion::{PerceptionSettings, TrackingSettings};
+use flyrig_fusion::TrackingSettings;
 use flyrig_gpu::GpuContext;
 use flyrig_report::arguments::{FpsArgs, FramesArgs, parse_seconds};
 use flyrig_takes::{Take, TakeOptions};
 use flyrig_transport::TransportConfig;
 use flyrig_types::CameraId;
 
-use crate::opening::open_take;
+use crate::{
+    opening::open_take,
+    take_choices::{PerceptionArgs, cameras_of},
+};
 
 /// Cameras to read: live ones or a take.
 #[derive(Debug, Clone, Args)]
@@ -123,19 +126,36 @@ pub struct HoldoutArgs {
 pub struct DatasetArgs {
     /// Folder in EasyMocap layout: a calibration, images/CAM, optional mask/CAM and a skinned *.glb. Or a calibrated recording, *.mcap.
     pub dataset: PathBuf,
-    /// Input cameras, comma separated.
-    #[arg(long, value_delimiter = ',', value_parser = parse_camera, required = true)]
+    /// Input cameras, comma separated; by default all cameras that are not held out.
+    #[arg(long, value_delimiter = ',', value_parser = parse_camera)]
     pub inputs: Vec<String>,
     #[command(flatten)]
     pub range: FramesArgs,
     #[command(flatten)]
     pub rate: FpsArgs,
     #[command(flatten)]
-    pub perception: PerceptionSettings,
+    pub perception: PerceptionArgs,
     #[command(flatten)]
     pub tracking: TrackingSettings,
     #[command(flatten)]
     pub lags: LagArgs,
+}
+
+impl DatasetArgs {
+    /// Returns the arguments with the cameras and the sources of pose, masks and shape that the command line leaves open, and prints the
+    /// sources.
+    ///
+    /// # Errors
+    /// The take has no calibration, no such images, or a damaged glTF file.
+    pub fn resolve(&self, command: &str, holdout: &[String]) -> Result<Self> {
+        let mut chosen = self.clone();
+        if chosen.inputs.is_empty() {
+            chosen.inputs = cameras_of(&self.dataset, holdout)?;
+        }
+        chosen.perception.choose(&self.dataset, &chosen.inputs)?;
+        eprintln!("{command}: {}", chosen.perception.sources());
+        Ok(chosen)
+    }
 }
 
 /// Time offsets of cameras.

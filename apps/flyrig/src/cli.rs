@@ -121,11 +121,11 @@ pub enum Command {
         #[command(subcommand)]
         action: KeysAction,
     },
-    /// Publish a recorded person stream at its original pace, to test viewers without a rig.
+    /// Publish a recorded person stream at its original pace, to test viewers without a rig; or make a film of it with --orbit.
     Play(PlayArgs),
     /// Print rates and latency of a running rig, write images or a video.
     Watch(WatchArgs),
-    /// Replay a data set, render its held-out cameras and score them.
+    /// Evaluate a take: hold cameras out, render them and score them; write a report, a page that plays the take in 3D, and a film.
     Eval(EvalArgs),
     /// Build the avatar of a person, score it, drive it by recorded motion, export it.
     Avatar {

@@ -15,6 +15,7 @@ mod eval;
 mod import;
 mod keys;
 mod opening;
+mod orbit_film;
 mod plate;
 mod pose_recording;
 mod recording;
@@ -25,8 +26,10 @@ mod sim_export;
 mod simulator_file;
 #[cfg(test)]
 mod source_tests;
+mod stream_film;
 mod stream_recording;
 mod sync_check;
+mod take_choices;
 mod toml_errors;
 mod video_file;
 mod view;
@@ -128,7 +131,10 @@ fn dispatch(cli: &Cli) -> Result<()> {
             None => watch::watch(args),
         },
         Command::Keys { action } => keys::keys(action),
-        Command::Play(args) => stream_recording::play(args),
+        Command::Play(args) => match &args.orbit {
+            Some(path) => stream_film::film(&args.recording, path, &open_gpu(cli.program.adapter.as_deref())?),
+            None => stream_recording::play(args),
+        },
         Command::Avatar { action } => avatar::avatar(action, &|| open_gpu(cli.program.adapter.as_deref())),
         Command::Eval(args) => eval::eval(args, &open_gpu(cli.program.adapter.as_deref())?),
         Command::Sim { action: SimAction::Export(args) } => {

@@ -48,12 +48,17 @@ pub struct PlayArgs {
     /// Pace relative to that of the recording.
     #[arg(long, default_value_t = 1.0, value_parser = parse_speed)]
     pub speed: f64,
+    /// Write a film of a camera that walks around the person (*.mp4 or *.avi), and publish nothing.
+    #[arg(long, value_name = "FILE", conflicts_with_all = ["rig", "listen", "keys", "insecure", "repeat", "wait", "speed"])]
+    pub orbit: Option<PathBuf>,
 }
 
-const TOPIC: &str = "person-stream";
+/// Topic of the messages in a recording.
+pub(crate) const TOPIC: &str = "person-stream";
 const SCHEMA: &str = "flyrig.PersonStream";
-const MOTION: u8 = 255;
-const TEMPLATE: u8 = 254;
+/// First byte of a motion, and of a template.
+pub(crate) const MOTION: u8 = 255;
+pub(crate) const TEMPLATE: u8 = 254;
 /// Longest wait for a template.
 const TEMPLATE_PATIENCE: Duration = Duration::from_secs(10);
 /// Interval between lines with counts.

@@ -38,6 +38,8 @@ pub struct Report {
     pub facts: Vec<(String, String)>,
     /// Summary below the heading.
     pub sentences: Vec<String>,
+    /// Text and relative address of links below the summary.
+    pub links: Vec<(String, String)>,
     /// Tables of text.
     pub tables: Vec<Table>,
     /// Heading and SVG of each drawing; the SVG is inserted unescaped.
@@ -118,10 +120,13 @@ impl Report {
         page
     }
 
-    /// Writes sentences, facts and tables.
+    /// Writes sentences, links, facts and tables.
     fn write_texts(&self, page: &mut String) {
         for sentence in &self.sentences {
             let _ = write!(page, "<p>{}", escape_html(sentence));
+        }
+        for (text, address) in &self.links {
+            let _ = write!(page, "<p><a href=\"{}\">{}</a>", escape_html(address), escape_html(text));
         }
         if !self.facts.is_empty() {
             page.push_str("<table>");
@@ -263,6 +268,7 @@ mod tests {
                 ],
             }],
             sentences: vec!["1 < 2".to_owned()],
+            links: vec![("the \"film\"".to_owned(), "a\"b.mp4".to_owned())],
             tables: vec![Table {
                 title: "cameras".to_owned(),
                 head: vec!["camera".to_owned()],
@@ -278,6 +284,7 @@ mod tests {
         let html = report.html();
         assert!(html.contains("a &lt;b&gt;") && html.contains("x &amp; y"));
         assert!(html.contains("<p>1 &lt; 2") && html.contains("<th>camera<tr><td>left &amp; right</table>"));
+        assert!(html.contains("<p><a href=\"a&quot;b.mp4\">the &quot;film&quot;</a>"), "{html}");
         assert!(html.contains("<h2>above</h2><svg><circle"));
         assert!(html.contains("data:image/png;base64,AQID"));
         assert!(html.contains("<polyline") && !html.contains("NaN"));

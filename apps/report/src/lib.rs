@@ -13,6 +13,6 @@ mod trace;
 
 pub use contact::contact_images;
 pub use html::{ContactRow, Curve, Report, Table, write_whole};
-pub use outlines::{outlined_inputs, paint_outline};
+pub use outlines::{outlined_inputs, outlined_view, paint_outline};
 pub use progress::progress_bar;
 pub use trace::traced;

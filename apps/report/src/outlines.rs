@@ -1,7 +1,10 @@
 //! Input images with the outlines of mask and rendered person, which show whether masks, pose and calibration fit.
 
-use anyhow::Result;
+use anyhow::{Result, ensure};
+use flyrig_capture::to_rgb8;
 use flyrig_fusion::{PersonId, Session};
+use flyrig_metrics::{BOX_MARGIN_PX, PixelBox, person_box};
+use flyrig_types::{Frame, Mask, RenderedView};
 
 use crate::png;
 
@@ -10,7 +13,7 @@ const MASK: [u8; 3] = [0, 255, 80];
 /// Colour of the rendered person's outline.
 const DRAWN: [u8; 3] = [255, 0, 200];
 
-/// Encodes every input view of a person's last update as a captioned PNG image with outlines.
+/// Encodes every input view of a person's last update as a captioned PNG image with outlines, cropped to the person.
 ///
 /// # Errors
 /// A view cannot be rendered.
@@ -27,9 +30,48 @@ pub fn outlined_inputs(session: &mut Session, person: PersonId) -> Result<Vec<(S
         paint_outline(&mut rgb, seen, width, height, MASK);
         paint_outline(&mut rgb, &drawn.rgba, width, height, DRAWN);
         let caption = format!("input {}: mask green, ours magenta", camera.id);
-        out.push((caption, png::encode_rgb(&rgb, drawn.width, drawn.height)?));
+        let covered = |at: usize| seen[at].max(drawn.rgba[at]);
+        let either = (3..seen.len()).step_by(4).map(covered).collect();
+        let area = person_box(&Mask::new(drawn.width, drawn.height, either)?, BOX_MARGIN_PX);
+        out.push((caption, cropped(&rgb, width, area.unwrap_or([0, 0, drawn.width, drawn.height]))?));
     }
     Ok(out)
+}
+
+/// Encodes a held-out image as a captioned PNG image, cropped to the person, with the outlines of its mask, if there is one, and of the
+/// rendered view. `None` where the view shows nobody.
+///
+/// # Errors
+/// The image cannot be read, or sizes differ.
+pub fn outlined_view(view: &RenderedView, truth: &Frame, mask: Option<&Mask>) -> Result<Option<(String, Vec<u8>)>> {
+    let (width, height) = (view.width as usize, view.height as usize);
+    let mut rgb = to_rgb8(&truth.image)?;
+    let alpha = |rgba: &[u8]| rgba.chunks_exact(4).map(|pixel| pixel[3]).collect::<Vec<u8>>();
+    let silhouette = Mask::new(view.width, view.height, alpha(&view.rgba))?;
+    // The box of the images beside it.
+    let shown = truth.mask.as_ref().unwrap_or(&silhouette);
+    let Ok(area) = person_box(shown, BOX_MARGIN_PX) else { return Ok(None) };
+    let fits = |mask: &Mask| (mask.width(), mask.height()) == (view.width, view.height);
+    ensure!(
+        rgb.len() == 3 * width * height && truth.mask.as_ref().is_none_or(fits),
+        "camera {}: image and view differ in size",
+        truth.camera
+    );
+    let mut caption = format!("held-out {}: ours magenta", truth.camera);
+    if let Some(mask) = mask.filter(|mask| fits(mask)) {
+        let rgba: Vec<u8> = mask.coverage().iter().flat_map(|&a| [0, 0, 0, a]).collect();
+        paint_outline(&mut rgb, &rgba, width, height, MASK);
+        caption = format!("held-out {}: mask green, ours magenta", truth.camera);
+    }
+    paint_outline(&mut rgb, &view.rgba, width, height, DRAWN);
+    Ok(Some((caption, cropped(&rgb, width, area)?)))
+}
+
+/// Encodes the pixels of a box in an image of this width.
+fn cropped(rgb: &[u8], width: usize, [left, top, right, bottom]: PixelBox) -> Result<Vec<u8>> {
+    let row = |y: usize| &rgb[3 * (y * width + left as usize)..3 * (y * width + right as usize)];
+    let cut: Vec<u8> = (top as usize..bottom as usize).flat_map(row).copied().collect();
+    png::encode_rgb(&cut, right - left, bottom - top)
 }
 
 /// Paints the pixels of `rgb` whose alpha in `rgba` is at least 128 while that of a neighbour is not.

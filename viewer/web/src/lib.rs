@@ -8,6 +8,8 @@
 //! A WebSocket message is a kind (0 rig, 1 template, 2 motion, 3 colours, 4 state, 5 forget), three zero bytes, the number of a person (u32,
 //! little endian) and the payload. The browser sends one text message, the token of its link.
 //!
+//! [`TakePage`] is a page in one file that plays a stored take without a server.
+//!
 //! ```no_run
 //! use flyrig_transport::TransportConfig;
 //! use flyrig_web::{WebConfig, WebServer};
@@ -25,9 +27,11 @@ mod guard;
 mod hub;
 mod server;
 mod socket;
+mod take_page;
 mod tls;
 mod upstream;
 
 pub use config::WebConfig;
 pub use error::WebError;
 pub use server::WebServer;
+pub use take_page::TakePage;

@@ -23,7 +23,7 @@ use crate::arguments::DatasetArgs;
 const GAUSSIANS: u32 = 41_000;
 
 /// Arguments of `flyrig avatar build`.
-#[derive(Debug, Args)]
+#[derive(Debug, Clone, Args)]
 pub struct AvatarBuildArgs {
     #[command(flatten)]
     pub take: DatasetArgs,
@@ -101,6 +101,7 @@ const PICTURES: u64 = 10;
 pub fn build(args: &AvatarBuildArgs, gpu: &GpuContext) -> Result<()> {
     let folder = args.out.parent().filter(|folder| !folder.as_os_str().is_empty()).unwrap_or(Path::new("."));
     ensure!(folder.is_dir(), "the folder {} does not exist; make it, or choose another --out", folder.display());
+    let args = &AvatarBuildArgs { take: args.take.resolve("avatar build", &[])?, ..args.clone() };
     let AvatarTake { frames, views, mut avatar, uvs, numbers, camera } = track(args, gpu)?;
     let first = frames.first().cloned().context("no frame")?;
     let scene = AvatarScene::new(gpu, &avatar)?;
@@ -265,8 +266,8 @@ impl<'a> Building<'a> {
             method: method(self.args.method, &LocalSettings::default()),
             cameras: take.inputs.clone(),
             frames,
-            pose: format!("{:?}", take.perception.pose).to_lowercase(),
-            masks: format!("{:?}", take.perception.masks).to_lowercase(),
+            pose: format!("{:?}", take.perception.settings.pose).to_lowercase(),
+            masks: format!("{:?}", take.perception.settings.masks).to_lowercase(),
             steps: self.done,
             seed: self.args.seed,
             training_db,

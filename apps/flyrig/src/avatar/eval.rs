@@ -23,7 +23,7 @@ use super::{
 use crate::arguments::{DatasetArgs, HoldoutArgs};
 
 /// Arguments of `flyrig avatar eval`.
-#[derive(Debug, Args)]
+#[derive(Debug, Clone, Args)]
 pub struct AvatarEvalArgs {
     /// The avatar (*.flyavatar).
     pub avatar: PathBuf,
@@ -65,6 +65,8 @@ pub fn eval(args: &AvatarEvalArgs, gpu: &GpuContext) -> Result<()> {
     let avatar = load(&args.avatar)?;
     let nodes = avatar.hanging.as_ref().map_or(1, |hanging| hanging.nodes.len());
     let body = BodySettings { gaussians: avatar.gaussians(), nodes, ..BodySettings::default() };
+    let take = args.take.resolve("avatar eval", &args.holdout.holdout)?;
+    let args = &AvatarEvalArgs { take, ..args.clone() };
     let mut take = args.take.clone();
     if !args.deformed {
         take.tracking.solver = Solver::None;

@@ -40,7 +40,7 @@ pub(super) fn open_replay(
         inputs: take.inputs.clone(),
         holdout: holdout.to_vec(),
         session: SessionSettings {
-            perception: take.perception.clone(),
+            perception: take.perception.settings.clone(),
             body: body.clone(),
             tracking: take.tracking.clone(),
             appearance: AppearanceOptions::default(),
