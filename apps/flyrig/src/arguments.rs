@@ -1,6 +1,9 @@
 //! Groups of arguments that several commands share.
 
-use std::{collections::BTreeMap, path::PathBuf};
+use std::{
+    collections::BTreeMap,
+    path::{Path, PathBuf},
+};
 
 use anyhow::{Result, ensure};
 use clap::Args;
@@ -8,7 +11,7 @@ use flyrig_access::{KeyFile, Role};
 use flyrig_fusion::TrackingSettings;
 use flyrig_gpu::GpuContext;
 use flyrig_report::arguments::{FpsArgs, FramesArgs, parse_seconds};
-use flyrig_takes::{Take, TakeOptions};
+use flyrig_takes::{Take, TakeOptions, check_take};
 use flyrig_transport::TransportConfig;
 use flyrig_types::CameraId;
 
@@ -139,15 +142,37 @@ pub struct DatasetArgs {
     pub tracking: TrackingSettings,
     #[command(flatten)]
     pub lags: LagArgs,
+    #[command(flatten)]
+    pub trust: TrustArgs,
+}
+
+/// Check of a take's calibration.
+#[derive(Debug, Clone, Copy, Args)]
+pub struct TrustArgs {
+    /// Take the calibration as it is: otherwise that of a folder which was never checked is measured on the person in it, and corrected
+    /// where that agrees better.
+    #[arg(long)]
+    pub trust_calibration: bool,
+}
+
+impl TrustArgs {
+    /// Checks the calibration of a folder that was never checked, unless it is trusted.
+    ///
+    /// # Errors
+    /// The calibration cannot be read, or what was found cannot be written.
+    pub fn check(self, take: &Path, fps: f64, gpu: &GpuContext) -> Result<()> {
+        if self.trust_calibration { Ok(()) } else { check_take(take, fps, &|| Ok(gpu.clone())) }
+    }
 }
 
 impl DatasetArgs {
-    /// Returns the arguments with the cameras and the sources of pose, masks and shape that the command line leaves open, and prints the
-    /// sources.
+    /// Checks the calibration, and returns the arguments with the cameras and the sources of pose, masks and shape that the command line
+    /// leaves open; prints the sources.
     ///
     /// # Errors
     /// The take has no calibration, no such images, or a damaged glTF file.
-    pub fn resolve(&self, command: &str, holdout: &[String]) -> Result<Self> {
+    pub fn resolve(&self, command: &str, holdout: &[String], gpu: &GpuContext) -> Result<Self> {
+        self.trust.check(&self.dataset, self.rate.fps, gpu)?;
         let mut chosen = self.clone();
         if chosen.inputs.is_empty() {
             chosen.inputs = cameras_of(&self.dataset, holdout)?;

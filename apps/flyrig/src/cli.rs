@@ -14,9 +14,10 @@ use flyrig_report::arguments::ProgramArgs;
 use flyrig_training::TrainArgs;
 
 use crate::{
-    avatar::AvatarAction, calibrate::CalibrateAction, demo::DemoArgs, eval::EvalArgs, import::ImportArgs,
-    keys::KeysAction, plate::PlateArgs, recording::RecordArgs, replay::ReplayArgs, serve::ServeArgs,
-    sim_export::SimAction, stream_recording::PlayArgs, sync_check::SyncCheckArgs, view::ViewArgs, watch::WatchArgs,
+    arguments::TrustArgs, avatar::AvatarAction, calibrate::CalibrateAction, demo::DemoArgs, eval::EvalArgs,
+    import::ImportArgs, keys::KeysAction, plate::PlateArgs, recording::RecordArgs, replay::ReplayArgs,
+    serve::ServeArgs, sim_export::SimAction, stream_recording::PlayArgs, sync_check::SyncCheckArgs, view::ViewArgs,
+    watch::WatchArgs,
 };
 
 /// Live free-viewpoint video of a person from a few cameras.
@@ -81,6 +82,8 @@ pub enum Command {
         /// Show a live table of the cameras instead of a line of rates.
         #[arg(long)]
         table: bool,
+        #[command(flatten)]
+        trust: TrustArgs,
     },
     /// Send the cameras of this computer to a rig on another one (source.kind = "network" there) until Ctrl-C. Uses the tables [rig],
     /// [source], [capture], [transport] and [health] of the configuration; V4L2 cameras need no calibration.

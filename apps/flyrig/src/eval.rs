@@ -23,9 +23,8 @@ use shown::Shown;
 /// Runs the command.
 pub fn eval(args: &EvalArgs, gpu: &GpuContext) -> Result<()> {
     let started = Instant::now();
-    let take = args.take.resolve("eval", &args.holdout.holdout)?;
+    let take = args.take.resolve("eval", &args.holdout.holdout, gpu)?;
     let args = &EvalArgs { take, ..args.clone() };
-    // Here a take's calibration can be mended: cameras and sources are chosen, nothing was estimated with it yet.
     let plan = Plan::new(&args.take.inputs, &args.holdout.holdout);
     eprintln!("eval: {}", plan.method);
     std::fs::create_dir_all(&args.out).with_context(|| format!("cannot create {}", args.out.display()))?;

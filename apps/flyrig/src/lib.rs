@@ -101,10 +101,17 @@ pub fn main() -> ExitCode {
 fn dispatch(cli: &Cli) -> Result<()> {
     match &cli.command {
         Command::Demo(args) => demo::demo(args, &open_gpu(cli.program.adapter.as_deref())?),
-        Command::Run { config, record, table } => {
+        Command::Run { config, record, table, trust } => {
             let config = Config::load(config)?;
             let adapter = cli.program.adapter.as_deref().or(Some(config.gpu.adapter.as_str()));
-            run::run(&config, &open_gpu(adapter)?, record.as_deref(), *table)
+            let gpu = open_gpu(adapter)?;
+            let source = &config.source;
+            if matches!(source.kind, SourceKind::Folder | SourceKind::Video)
+                && source.calibration.as_os_str().is_empty()
+            {
+                trust.check(&source.path, source.fps, &gpu)?;
+            }
+            run::run(&config, &gpu, record.as_deref(), *table)
         }
         Command::Record(args) => {
             let config = Config::load_for_capture(&args.config)?;

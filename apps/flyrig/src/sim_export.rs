@@ -9,7 +9,9 @@ use anyhow::Result;
 use clap::{Args, Subcommand};
 use flyrig_gpu::GpuContext;
 use flyrig_report::{progress_bar, stop};
-use flyrig_sim::{ExportOptions, SimConfig, Simulator, export};
+use flyrig_sim::{CalibrationError, ExportOptions, SimConfig, Simulator, export};
+
+use flyrig_takes::mark_checked;
 
 use crate::{config::Config, simulator_file};
 
@@ -61,6 +63,10 @@ pub fn sim_export(args: &SimExportArgs, config: &SimConfig, gpu: &GpuContext) ->
     });
     bar.finish_and_clear();
     let exported = exported?;
+    let is_exact = config.calibration_error == CalibrationError::default() && config.sensors.is_empty();
+    if is_exact && config.faults.faults.is_empty() {
+        mark_checked(&args.out)?;
+    }
     let names: Vec<&str> = simulator.rig().cameras.iter().map(|camera| camera.id.as_str()).collect();
     println!(
         "{}: {} frames of {} cameras, {} images in {:.1} s on {}",

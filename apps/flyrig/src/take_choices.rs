@@ -63,7 +63,8 @@ impl PerceptionArgs {
             footage.folder().is_some_and(|root| cameras.iter().all(|camera| has(root, camera)))
         };
         if !self.names_masks {
-            let is_given = all_have(&|root, camera| root.join("mask").join(camera).is_dir());
+            let has_images = matches!(footage, Footage::Folder(_));
+            let is_given = has_images && all_have(&|root, camera| root.join("mask").join(camera).is_dir());
             settings.masks = if is_given { Origin::Given } else { Origin::Estimated };
         }
         if !self.names_pose {
@@ -100,7 +101,11 @@ fn has_motion(root: &Path) -> Result<bool> {
 pub fn cameras_of(take: &Path, left_out: &[String]) -> Result<Vec<String>> {
     let footage = Footage::from_dataset(take);
     let rig = footage.load_rig(&[])?;
-    let has_images = |id: &CameraId| footage.folder().is_none_or(|root| root.join("images").join(id.as_str()).is_dir());
+    let has_images = |id: &CameraId| match &footage {
+        Footage::Folder(root) => root.join("images").join(id.as_str()).is_dir(),
+        Footage::VideoFolder(root) => dataset::video_file(root, id).exists(),
+        Footage::Recording(_) | Footage::Videos(_) => true,
+    };
     let (found, without): (Vec<_>, Vec<_>) = rig.cameras.iter().map(|camera| &camera.id).partition(|id| has_images(id));
     if !without.is_empty() {
         let names: Vec<&str> = without.iter().map(|id| id.as_str()).collect();

@@ -101,7 +101,7 @@ const PICTURES: u64 = 10;
 pub fn build(args: &AvatarBuildArgs, gpu: &GpuContext) -> Result<()> {
     let folder = args.out.parent().filter(|folder| !folder.as_os_str().is_empty()).unwrap_or(Path::new("."));
     ensure!(folder.is_dir(), "the folder {} does not exist; make it, or choose another --out", folder.display());
-    let args = &AvatarBuildArgs { take: args.take.resolve("avatar build", &[])?, ..args.clone() };
+    let args = &AvatarBuildArgs { take: args.take.resolve("avatar build", &[], gpu)?, ..args.clone() };
     let AvatarTake { frames, views, mut avatar, uvs, numbers, camera } = track(args, gpu)?;
     let first = frames.first().cloned().context("no frame")?;
     let scene = AvatarScene::new(gpu, &avatar)?;

@@ -65,7 +65,7 @@ pub fn eval(args: &AvatarEvalArgs, gpu: &GpuContext) -> Result<()> {
     let avatar = load(&args.avatar)?;
     let nodes = avatar.hanging.as_ref().map_or(1, |hanging| hanging.nodes.len());
     let body = BodySettings { gaussians: avatar.gaussians(), nodes, ..BodySettings::default() };
-    let take = args.take.resolve("avatar eval", &args.holdout.holdout)?;
+    let take = args.take.resolve("avatar eval", &args.holdout.holdout, gpu)?;
     let args = &AvatarEvalArgs { take, ..args.clone() };
     let mut take = args.take.clone();
     if !args.deformed {
