@@ -138,7 +138,7 @@ pub(super) fn live(progress: &CalibrationState<'_>, sentence: &str) -> Report {
 pub(super) fn unjoined(progress: &CalibrationState<'_>, sentence: String) -> Report {
     let live = live(progress, "");
     Report {
-        title: format!("{} cameras that the boards do not join", progress.ids.len()),
+        title: format!("The boards do not join these {} cameras", progress.ids.len()),
         refresh_secs: None,
         sentences: vec![sentence],
         tables: std::iter::once(shared(progress)).chain(live.tables).collect(),

@@ -278,7 +278,7 @@ mod tests {
 
     /// Searches a take without a board and says how much of it was looked at.
     fn looked(input: &[PathBuf], secs: Option<f64>, every_ms: Option<f64>) -> String {
-        let board = Board { columns: 7, rows: 5, square_mm: 50.0, pattern: flyrig_calib::Pattern::Chessboard };
+        let board = Board { columns: 7, rows: 6, square_mm: 50.0, pattern: flyrig_calib::Pattern::Chessboard };
         let source = InputArgs { input: input.to_vec(), rate: FpsArgs { fps: 30.0 } };
         let args = BoardTakeArgs { secs, every_ms, source };
         let take = open_frames(&args, &|| anyhow::bail!("no adapter is needed")).unwrap();
