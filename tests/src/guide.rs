@@ -29,7 +29,7 @@ impl Block {
         let first_word = |line: &String| line.split_whitespace().next().unwrap_or_default().to_owned();
         let is_commands = self.lines.first().is_some_and(|line| PROGRAMS.contains(&first_word(line).as_str()));
         let numbered = self.lines.iter().enumerate().filter(|(_, line)| is_commands && !line.trim().is_empty());
-        numbered.map(|(i, line)| (self.line + i, words(line))).collect()
+        numbered.map(|(i, line)| (self.line + i, words(line))).filter(|(_, words)| !words.is_empty()).collect()
     }
 
     /// Returns whether a command of the block is to be run.
@@ -131,7 +131,7 @@ mod tests {
 
     #[test]
     fn blocks_are_found_with_their_marks_and_files() {
-        let page = "# Title\n\n    flyrig a \"x y\" # comment\n    flyrig b > c.toml\n\ntext\n\n\
+        let page = "# Title\n\n    flyrig a \"x y\" # comment\n    # by hand\n    flyrig b > c.toml\n\ntext\n\n\
                     1. Write `rig.toml` so:\n\n       [source]\n       kind = \"sim\"\n\n       [rig]\n\n\
                     <!-- not run: needs a desktop -->\n    flyrig view\n\n\
                     <!-- not run (view, calibrate live): needs cameras -->\n```sh\nflyrig view\nflyrig calibrate live x\nflyrig \
@@ -145,7 +145,7 @@ mod tests {
         assert_eq!((blocks[1].file(), blocks[1].lines.len()), (Some("rig.toml"), 4));
         assert_eq!(blocks[2].unrun, Some(Vec::new()));
         let runs: Vec<bool> = blocks[3].commands().iter().map(|(_, words)| blocks[3].runs(words)).collect();
-        assert_eq!((runs, blocks[3].line), (vec![false, false, true], 21));
+        assert_eq!((runs, blocks[3].line), (vec![false, false, true], 22));
     }
 
     #[test]

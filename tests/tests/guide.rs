@@ -217,7 +217,7 @@ impl Reader {
         let endpoint = self.endpoint.clone();
         let own_endpoint = free_endpoint();
         match args[0] {
-            "watch" if args.contains(&"--record") => args.extend(["--connect", &endpoint, "--seconds", "5"]),
+            "watch" if args.contains(&"--record") => args.extend(["--connect", &endpoint, "--seconds", "10"]),
             "watch" => args.extend(["--connect", &endpoint, "--count", "2"]),
             "serve" => args.extend(["--connect", &endpoint, "--listen", "127.0.0.1:0"]),
             "play" => args.extend(["--listen", &own_endpoint]),
@@ -384,5 +384,8 @@ fn a_running_rig_is_watched() {
     follow("viewing.md", |reader| {
         reader.start("the rig", &["run", "rig.toml"]);
         reader.beside = reader.running.pop().map(|(_, rig)| rig);
+        // The first image is that of a person.
+        let endpoint = reader.endpoint.clone();
+        done(reader.path(), &["watch", "--connect", &endpoint, "--count", "1"]);
     });
 }

@@ -91,7 +91,8 @@ fn a_recording_whose_cameras_leave_their_folder_is_refused_and_nothing_is_writte
         record_one(&inside.join("evil.mcap"), name);
         let of = |args: &[&str]| run(PROGRAM, args, &inside).unwrap();
         let export = of(&["replay", "evil.mcap", "--export", "out"]);
-        assert_eq!(export.stderr.lines().count(), 1, "{export:?}");
+        // What is opened, and the error.
+        assert_eq!(export.stderr.lines().count(), 2, "{export:?}");
         let eval = "eval evil.mcap --inputs a --holdout b --pose estimated --masks estimated --out out";
         for finished in [export, of(&eval.split(' ').collect::<Vec<_>>())] {
             assert_eq!(finished.code, Some(1), "{name:?}: {finished:?}");

@@ -93,7 +93,7 @@ pub fn main() -> ExitCode {
     let cli = Cli::from_arguments();
     program::start_log(cli.program.verbose, cli.log_json);
     if let Some(line) = cli.command.first_line() {
-        eprintln!("{line}");
+        eprintln!("{}", flyrig_types::escape_controls(&line));
     }
     program::exit_code(traced(cli.program.trace.as_deref(), || dispatch(&cli)))
 }
