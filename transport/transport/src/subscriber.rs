@@ -227,6 +227,11 @@ impl Subscriber {
         self.people.ask_template(hash, timeout)
     }
 
+    /// Fetches the last motions again; they come through [`Self::next_person`].
+    pub(crate) fn fetch_motions(&self) {
+        self.people.rig_appeared();
+    }
+
     /// Fetches the present colours of a person whose template [`Self::template`] returned; they come through [`Self::next_person`]. Never
     /// waits.
     pub fn fetch_colors(&self, person: u32) {

@@ -162,6 +162,8 @@ impl Work {
             self.known.clear();
             self.calibration = None;
             self.outlet = Some(Publisher::open(&self.to)?);
+            // The motions that came before are lost, and those of a slow rig are rare.
+            self.subscriber.fetch_motions();
         }
         let Some(outlet) = &self.outlet else { return Ok(()) };
         if self.calibration.as_ref() != Some(&rig) {
