@@ -163,6 +163,7 @@ impl Command {
             Self::Record(args) => cameras("record", &args.config),
             Self::Capture { config, .. } => cameras("capture", config),
             Self::Replay(args) => take("replay", from_ref(&args.recording)),
+            Self::Import(args) => take("import", &args.inputs),
             Self::SyncCheck(args) => take("sync-check", &args.input.source.input),
             Self::Plate(args) => take("plate", from_ref(&args.input)),
             Self::Calibrate { action } => action.input().and_then(|(name, paths)| take(name, paths)),

@@ -93,10 +93,9 @@ impl Footage {
     /// Names the path, and what is expected in its place.
     pub(crate) fn check_dataset(&self) -> Result<()> {
         match self {
-            Self::Folder(root) => dataset::require_folder(
+            Self::Folder(root) | Self::VideoFolder(root) => dataset::require_folder(
                 root,
-                "a folder with a calibration and images/CAM, or a recording (*.mcap); `flyrig record` makes one of \
-                 videos (source.kind = \"video\")",
+                "a folder with a calibration and images/CAM or videos, or a recording (*.mcap); `flyrig import` makes one of other files",
             ),
             Self::Recording(path) => {
                 ensure!(path.exists(), "{} does not exist; name a recording of `flyrig record`", path.display());
