@@ -132,13 +132,15 @@ impl CameraCheck {
             let word = if light < 1.0 { "darker" } else { "brighter" };
             reasons.push(format!("it is {:.0} % {word} than the others predict", 100.0 * (light - 1.0).abs()));
         }
-        if reasons.is_empty() {
-            reasons.push("the person was not compared in it".to_owned());
-        }
-        let word = match grade {
-            Grade::Good => "good",
-            Grade::Fair => "fair",
-            Grade::Bad => "not good",
+        // What was fitted to a camera says less about it.
+        let words = match (score.is_some(), grade) {
+            _ if reasons.is_empty() => "was not compared, because the person was not seen in it",
+            (true, Grade::Good) => "is good: ",
+            (true, Grade::Fair) => "is fair: ",
+            (true, Grade::Bad) => "is not good: ",
+            (false, Grade::Good) => "fits the result, which was also fitted to it: ",
+            (false, Grade::Fair) => "fits roughly, although the result was also fitted to it: ",
+            (false, Grade::Bad) => "does not fit, although the result was also fitted to it: ",
         };
         Verdict {
             camera: camera.to_owned(),
@@ -147,7 +149,7 @@ impl CameraCheck {
             outline_share: shares,
             follows_motion: self.follows_motion(),
             light,
-            words: format!("Camera {camera} is {word}: {}.", reasons.join("; ")),
+            words: format!("Camera {camera} {words}{}.", reasons.join("; ")),
         }
     }
 
@@ -413,10 +415,16 @@ mod tests {
 
     #[test]
     fn nothing_to_compare_is_no_fault() {
-        let mut check = CameraCheck::default();
-        check.compare(0, &view(&[0; SIDE * SIDE], 9), &[0; 3 * SIDE * SIDE], &[0; SIDE * SIDE]);
-        check.compare(0, &view(&[0; SIDE * SIDE], 9), &[0; 30], &[0; 10]);
-        let verdict = check.verdict("01", None);
-        assert_eq!(verdict.words, "Camera 01 is good: the person was not compared in it.");
+        let mut empty = CameraCheck::default();
+        empty.compare(0, &view(&[0; SIDE * SIDE], 9), &[0; 3 * SIDE * SIDE], &[0; SIDE * SIDE]);
+        empty.compare(0, &view(&[0; SIDE * SIDE], 9), &[0; 30], &[0; 10]);
+        let verdict = empty.verdict("01", None);
+        assert_eq!(verdict.words, "Camera 01 was not compared, because the person was not seen in it.");
+        let input = check(0, 100, |_| [0, 0]).verdict("02", None);
+        assert!(
+            input.words.starts_with("Camera 02 fits the result, which was also fitted to it: its outline"),
+            "{}",
+            input.words
+        );
     }
 }

@@ -261,7 +261,7 @@ impl Progress {
         if self.bar.is_hidden() && self.printed.elapsed() >= PRINT_EVERY {
             self.printed = Instant::now();
             let left = self.started.elapsed().as_secs_f64() / done.max(1) as f64 * all.saturating_sub(done) as f64;
-            eprintln!("eval: {done} of {all} frame sets, about {left:.0} s left, {words}");
+            eprintln!("eval: {done} of {all} frame sets, about {left:.0} s left {words}");
         }
         self.bar.set_message(words);
     }
