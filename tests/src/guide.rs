@@ -145,7 +145,7 @@ mod tests {
         assert_eq!((blocks[1].file(), blocks[1].lines.len()), (Some("rig.toml"), 4));
         assert_eq!(blocks[2].unrun, Some(Vec::new()));
         let runs: Vec<bool> = blocks[3].commands().iter().map(|(_, words)| blocks[3].runs(words)).collect();
-        assert_eq!((runs, blocks[3].line), (vec![false, false, true], 22));
+        assert_eq!((runs, blocks[3].line), (vec![false, false, true], 21));
     }
 
     #[test]
