@@ -219,7 +219,14 @@ fn psnr_of_browser(who: Shown, drawing: &str, options: &[&str]) -> f64 {
         browser.evaluate("document.documentElement.dataset.ready") == "yes"
     });
     let seconds = started.elapsed().as_secs_f64();
-    // Wait a few seconds more, until every colour has been refined.
+    let first = browser.evaluate(SHOWN_FRAME).as_u64().unwrap_or_default();
+    // All colours come at once, before the rig has refined them: those of a later frame differ less from those of the frame before it.
+    wait_until("refined colours", || {
+        note(&receiver);
+        let shown = browser.evaluate(SHOWN_FRAME).as_u64().unwrap_or_default();
+        who == Shown::Avatar || shown > first + 20
+    });
+    // Wait a few seconds more, until the last of them have arrived.
     let until = Instant::now() + Duration::from_secs(6);
     while Instant::now() < until {
         note(&receiver);

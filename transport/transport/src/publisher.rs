@@ -18,6 +18,7 @@ use crate::{
     drain::{Drain, DrainThread, PublisherState, Retained},
     error::TransportError,
     header::{Header, MessageKind, empty_header},
+    host::host_id,
     json::{MAX_JSON_BYTES, from_json, to_json},
     keys::{self, MAX_PERSON_TOPICS, VIEWER_PREFIX},
     people::{
@@ -243,7 +244,8 @@ impl Publisher {
 
     fn offer_person(&self, person: u32, layer: Option<usize>, bytes: Bytes, header: Header) -> PublishOutcome {
         let topics = self.people.topics(person, &self.shared);
-        self.people.present.published(person, layer, &bytes, Instant::now());
+        let host = if header.host == 0 { host_id() } else { header.host };
+        self.people.present.published(person, layer, &bytes, host, Instant::now());
         topics
             .get(layer.map_or(0, |layer| layer + 1))
             .map_or(PublishOutcome::Unwatched, |topic| self.offer(topic, Body::Bytes(bytes), header))

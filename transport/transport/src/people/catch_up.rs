@@ -16,6 +16,7 @@ use zenoh::Session;
 use crate::{
     error::TransportError,
     header::{Header, MessageKind, empty_header},
+    host,
     inbox::{Inbox, Raw},
     keys,
     people::chunks::{ask, ask_template},
@@ -132,8 +133,8 @@ impl Link {
 
     fn fetch_motions(&self) -> Result<bool, TransportError> {
         let Some(packed) = self.ask(keys::LAST_MOTIONS)? else { return Ok(false) };
-        for (person, age, bytes) in unpack_motions(&packed) {
-            self.hand_over(keys::motion_label(person), MessageKind::Motion, bytes, age);
+        for (person, (host, age), bytes) in unpack_motions(&packed) {
+            self.hand_over(keys::motion_label(person), MessageKind::Motion, bytes, host, age);
         }
         // A relay, or a rig, may have its first person in a moment.
         Ok(!packed.is_empty())
@@ -161,36 +162,49 @@ impl Link {
             "fetched colours"
         );
         for (layer, bytes) in unpack_colors(&packed) {
-            self.hand_over(keys::color_label(person, layer), MessageKind::Colors, bytes, Duration::ZERO);
+            self.hand_over(keys::color_label(person, layer), MessageKind::Colors, bytes, 0, Duration::ZERO);
         }
         Ok(true)
     }
 
-    fn hand_over(&self, label: String, kind: MessageKind, bytes: &[u8], age: Duration) {
+    /// Hands a message to the reader that `host` handed in `age` ago; 0 for an unknown host.
+    fn hand_over(&self, label: String, kind: MessageKind, bytes: &[u8], host: u64, age: Duration) {
         let Ok(stamp) = stamp_of(bytes) else { return self.inbox.count_unreadable() };
-        let header = Header { kind, frame: stamp.frame, capture_nanos: stamp.capture_nanos, ..empty_header() };
         let latency_nanos = i64::try_from(age.as_nanos()).unwrap_or(i64::MAX);
+        let exact = host != 0 && host == host::host_id();
+        let header = Header {
+            kind,
+            frame: stamp.frame,
+            capture_nanos: stamp.capture_nanos,
+            host,
+            publish_unix_nanos: host::unix_nanos().saturating_sub(latency_nanos),
+            publish_nanos: if exact { host::monotonic_nanos().saturating_sub(latency_nanos) } else { 0 },
+            ..empty_header()
+        };
         let payload = Bytes::copy_from_slice(bytes);
-        self.inbox.hand_over(label, Raw { header, payload, latency_nanos, exact: false });
+        self.inbox.hand_over(label, Raw { header, payload, latency_nanos, exact });
     }
 }
 
-/// Appends a motion: person, age in nanoseconds, length, bytes.
-pub(crate) fn pack_motion(packed: &mut Vec<u8>, person: u32, age: Duration, bytes: &[u8]) {
+/// Appends a motion: person, host that handed it in, age in nanoseconds, length, bytes.
+pub(crate) fn pack_motion(packed: &mut Vec<u8>, person: u32, (host, age): (u64, Duration), bytes: &[u8]) {
     packed.extend(person.to_le_bytes());
+    packed.extend(host.to_le_bytes());
     packed.extend(u64::try_from(age.as_nanos()).unwrap_or(u64::MAX).to_le_bytes());
     packed.extend((bytes.len() as u32).to_le_bytes());
     packed.extend(bytes);
 }
 
 /// Reads motions until the bytes end or are damaged.
-fn unpack_motions(mut packed: &[u8]) -> impl Iterator<Item = (u32, Duration, &[u8])> {
+fn unpack_motions(mut packed: &[u8]) -> impl Iterator<Item = (u32, (u64, Duration), &[u8])> {
     std::iter::from_fn(move || {
         let (person, rest) = packed.split_first_chunk()?;
+        let (host, rest) = rest.split_first_chunk()?;
         let (age, rest) = rest.split_first_chunk()?;
         let (bytes, rest) = split_message(rest)?;
         packed = rest;
-        Some((u32::from_le_bytes(*person), Duration::from_nanos(u64::from_le_bytes(*age)), bytes))
+        let sent = (u64::from_le_bytes(*host), Duration::from_nanos(u64::from_le_bytes(*age)));
+        Some((u32::from_le_bytes(*person), sent, bytes))
     })
 }
 
@@ -231,10 +245,10 @@ mod tests {
     #[test]
     fn packed_messages_come_back_and_damaged_ones_end_the_list() {
         let mut packed = Vec::new();
-        pack_motion(&mut packed, 3, Duration::from_millis(40), b"abc");
-        pack_motion(&mut packed, 9, Duration::ZERO, b"");
+        pack_motion(&mut packed, 3, (8, Duration::from_millis(40)), b"abc");
+        pack_motion(&mut packed, 9, (0, Duration::ZERO), b"");
         let found: Vec<_> = unpack_motions(&packed).collect();
-        assert_eq!(found, [(3, Duration::from_millis(40), &b"abc"[..]), (9, Duration::ZERO, &b""[..])]);
+        assert_eq!(found, [(3, (8, Duration::from_millis(40)), &b"abc"[..]), (9, (0, Duration::ZERO), &b""[..])]);
         assert!((0..packed.len()).all(|end| unpack_motions(&packed[..end]).count() < 2));
         let messages = vec![(0, b"x".to_vec()), (2, vec![7; 300])];
         let packed = pack_colors(&messages);

@@ -48,6 +48,8 @@ enum Source {
 struct Motion {
     at: Instant,
     interval: Duration,
+    /// Identity of the host that handed it in.
+    host: u64,
     bytes: Bytes,
 }
 
@@ -91,8 +93,8 @@ impl PresentPeople {
         }
     }
 
-    /// Records a message of the person stream.
-    pub fn published(&self, person: u32, layer: Option<usize>, bytes: &Bytes, now: Instant) {
+    /// Records a message of the person stream that `host` handed in.
+    pub fn published(&self, person: u32, layer: Option<usize>, bytes: &Bytes, host: u64, now: Instant) {
         if layer.is_some() {
             if let Some(Source::Decoded(decoder)) = lock(&self.sources).get_mut(&person) {
                 // Damaged colours count as missed here as well.
@@ -102,7 +104,7 @@ impl PresentPeople {
         }
         let mut motions = lock(&self.motions);
         let interval = motions.get(&person).map_or(FIRST_INTERVAL, |last| now.saturating_duration_since(last.at));
-        motions.insert(person, Motion { at: now, interval, bytes: bytes.clone() });
+        motions.insert(person, Motion { at: now, interval, host, bytes: bytes.clone() });
         while motions.len() > MAX_PERSON_TOPICS + 1 {
             motions.pop_first();
         }
@@ -111,10 +113,10 @@ impl PresentPeople {
     /// Returns the last motion of each person who is present.
     pub fn motions(&self, now: Instant) -> Vec<u8> {
         let mut packed = Vec::new();
-        for (person, Motion { at, interval, bytes }) in &*lock(&self.motions) {
+        for (person, Motion { at, interval, host, bytes }) in &*lock(&self.motions) {
             let age = now.saturating_duration_since(*at);
             if age < GONE_AFTER + interval.saturating_mul(GONE_INTERVALS) {
-                pack_motion(&mut packed, *person, age, bytes);
+                pack_motion(&mut packed, *person, (*host, age), bytes);
             }
         }
         packed
