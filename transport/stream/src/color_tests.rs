@@ -159,7 +159,7 @@ fn colours_stay_until_an_encoder_that_begins_anew_has_sent_others() {
     decoder.ingest(&empty(8.0, 2)[0]).unwrap();
     assert!(decoder.known(0) <= 0.0);
     assert!((rms(&mut decoder, &encoded, &colors) - before).abs() < 1e-9);
-    for message in messages(8.0, 2) {
+    for message in messages(8.0, 4) {
         decoder.ingest(&message).unwrap();
     }
     assert_eq!((decoder.known(0), decoder.known(2)), (1.0, 1.0));

@@ -472,7 +472,7 @@ fn a_relay_passes_people_on_to_its_own_viewers() {
             }
             fetched = fetched.or_else(|| viewer.template(hash, Duration::from_millis(50)).unwrap());
         }
-        let fetched = fetched.or_else(|| viewer.template(hash, PATIENCE).unwrap());
+        let fetched = fetched.or_else(|| Some(wait_for("the template", || viewer.template(hash, PATIENCE).unwrap())));
         assert_eq!(fetched, Some(template));
         wait_for("the calibration", || viewer.rig(Duration::ZERO).unwrap());
         wait_until("no more trouble", || relay.trouble().is_none());
