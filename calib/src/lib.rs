@@ -54,7 +54,7 @@ pub use lens::{LensFit, calibrate_lens};
 pub use person::{Agreement, OutlineCorner, PersonCamera, PersonFit, PersonOptions, PersonTracks, calibrate_person};
 pub use print::BoardSheet;
 pub use projection::LensModel;
-pub use resize::{Fit, Resize, resize_lens};
+pub use resize::{Crop, Resize, resize_lens};
 pub use rig::{CornerError, RigCamera, RigFit, RigOptions, calibrate_rig};
 pub use start::Pair;
 pub use uncertainty::Uncertainty;

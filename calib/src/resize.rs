@@ -12,14 +12,14 @@ const MOST_CROP: f64 = 1.5;
 
 /// Relation of images to those of their calibration, where the aspect ratio differs.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub enum Fit {
+pub enum Crop {
     /// They fill their area: the longer direction was cut off evenly at both ends.
     Cropped,
     /// They show all of the calibrated images, and more at both ends of the other direction.
     Extended,
 }
 
-/// What was done to the calibrated images, for the user.
+/// Change from the calibrated images to others, for the user.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Resize {
     /// Pixels of the images over those of the calibration.
@@ -60,7 +60,7 @@ impl fmt::Display for Resize {
 ///
 /// # Errors
 /// The sizes say that the images were turned by a quarter, or are of another camera mode.
-pub fn resize_lens(lens: &Intrinsics, size: (u32, u32), fit: Fit) -> Result<(Intrinsics, Resize), String> {
+pub fn resize_lens(lens: &Intrinsics, size: (u32, u32), crop: Crop) -> Result<(Intrinsics, Resize), String> {
     let from = DVec2::new(f64::from(lens.width), f64::from(lens.height));
     let to = DVec2::new(f64::from(size.0), f64::from(size.1));
     let [(from_x, from_y), (to_x, to_y)] = [(lens.width, lens.height), size];
@@ -80,9 +80,9 @@ pub fn resize_lens(lens: &Intrinsics, size: (u32, u32), fit: Fit) -> Result<(Int
         };
         return Err(format!("{sizes}: {cause}"));
     }
-    let scale = match fit {
-        Fit::Cropped => ratios.max_element(),
-        Fit::Extended => ratios.min_element(),
+    let scale = match crop {
+        Crop::Cropped => ratios.max_element(),
+        Crop::Extended => ratios.min_element(),
     };
     let added = 0.5 * (to - scale * from);
     // Pixel centres lie at integers, edges at halves.
@@ -109,12 +109,12 @@ mod tests {
     fn points_land_where_the_scaled_and_cropped_image_has_them() {
         let point = DVec3::new(0.3, -0.2, 2.0);
         let before = project(&lens(), point).unwrap();
-        for (size, fit, scale, added, words) in [
-            ((960, 540), Fit::Cropped, 0.5, DVec2::ZERO, "scaled by 0.5000"),
-            ((1440, 1080), Fit::Cropped, 1.0, DVec2::new(-240.0, 0.0), "240.0 px cut off at left and right"),
-            ((1440, 1080), Fit::Extended, 0.75, DVec2::new(0.0, 135.0), "135.0 px added at top and bottom"),
+        for (size, crop, scale, added, words) in [
+            ((960, 540), Crop::Cropped, 0.5, DVec2::ZERO, "scaled by 0.5000"),
+            ((1440, 1080), Crop::Cropped, 1.0, DVec2::new(-240.0, 0.0), "240.0 px cut off at left and right"),
+            ((1440, 1080), Crop::Extended, 0.75, DVec2::new(0.0, 135.0), "135.0 px added at top and bottom"),
         ] {
-            let (resized, resize) = resize_lens(&lens(), size, fit).unwrap();
+            let (resized, resize) = resize_lens(&lens(), size, crop).unwrap();
             let expected = scale * (before + 0.5) - 0.5 + added;
             assert!(project(&resized, point).unwrap().distance(expected) < 1e-9, "{size:?}");
             assert_eq!((resized.width, resized.height), size);
@@ -124,10 +124,10 @@ mod tests {
 
     #[test]
     fn a_size_that_differs_by_a_row_is_scaled_and_others_are_refused() {
-        let (_, resize) = resize_lens(&lens(), (960, 541), Fit::Cropped).unwrap();
+        let (_, resize) = resize_lens(&lens(), (960, 541), Crop::Cropped).unwrap();
         assert!(resize.is_scaled_only(), "{resize}");
-        assert!(resize_lens(&lens(), (1080, 1920), Fit::Cropped).unwrap_err().contains("turned by a quarter"));
-        assert!(resize_lens(&lens(), (1920, 400), Fit::Cropped).unwrap_err().contains("calibrate at this size"));
-        assert!(resize_lens(&lens(), (0, 5), Fit::Cropped).unwrap_err().contains("a size is 0"));
+        assert!(resize_lens(&lens(), (1080, 1920), Crop::Cropped).unwrap_err().contains("turned by a quarter"));
+        assert!(resize_lens(&lens(), (1920, 400), Crop::Cropped).unwrap_err().contains("calibrate at this size"));
+        assert!(resize_lens(&lens(), (0, 5), Crop::Cropped).unwrap_err().contains("a size is 0"));
     }
 }

@@ -15,22 +15,22 @@ use flyrig_report::write_whole;
 use flyrig_takes::{Replay, known_body};
 
 pub use arguments::EvalArgs;
-use plan::Plan;
+use plan::EvalPlan;
 use report::Metrics;
 use run::{Evaluation, Run};
-use shown::Shown;
+use shown::TakeShow;
 
 /// Runs the command.
 pub fn eval(args: &EvalArgs, gpu: &GpuContext) -> Result<()> {
     let started = Instant::now();
     let take = args.take.resolve("eval", &args.holdout.holdout, gpu)?;
     let args = &EvalArgs { take, ..args.clone() };
-    let plan = Plan::new(&args.take.inputs, &args.holdout.holdout);
+    let plan = EvalPlan::new(&args.take.inputs, &args.holdout.holdout);
     eprintln!("eval: {}", plan.method);
     std::fs::create_dir_all(&args.out).with_context(|| format!("cannot create {}", args.out.display()))?;
     let mut runs = open(args, &plan, gpu)?;
     let first = runs.first_mut().context("no camera")?;
-    let mut shown = Shown::new(&args.name(), first.replay.session.rig(), args.orbit.as_deref())?;
+    let mut shown = TakeShow::new(&args.name(), first.replay.session.rig(), args.orbit.as_deref())?;
     let mut evaluation = Evaluation::new(&args.out, &runs);
     evaluation.run(&mut runs, &mut shown)?;
     let none = || format!("no frame of {} could be used; run with -v to see why", args.take.dataset.display());
@@ -61,7 +61,7 @@ pub fn eval(args: &EvalArgs, gpu: &GpuContext) -> Result<()> {
 }
 
 /// Opens the reconstructions of all splits.
-fn open(args: &EvalArgs, plan: &Plan, gpu: &GpuContext) -> Result<Vec<Run>> {
+fn open(args: &EvalArgs, plan: &EvalPlan, gpu: &GpuContext) -> Result<Vec<Run>> {
     let known = known_body(&args.body(), false)?;
     let count = plan.splits.len();
     let open = |(index, split): (usize, &plan::Split)| {

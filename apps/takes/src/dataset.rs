@@ -8,7 +8,7 @@ use flyrig_capture::{VideoOptions, VideoReplay, folder_image_size, read_image};
 use flyrig_fusion::{Origin, PerceptionSettings};
 use flyrig_types::{Camera, CameraId, Image, Rig, shortened};
 
-use crate::footage::{video_camera, video_files};
+use crate::video_files::{video_camera, video_files};
 
 /// Files of a calibration, of which at least one lies in a calibrated folder.
 const CALIBRATION_FILES: [&str; 3] = ["calibration.toml", "intri.yml", "extri.yml"];

@@ -25,6 +25,7 @@ mod source_section;
 mod take;
 mod true_joints;
 mod truth;
+mod video_files;
 
 pub use avatar_stream::encode_avatar;
 pub use avatar_take::AvatarTake;

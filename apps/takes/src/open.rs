@@ -11,6 +11,7 @@ use crate::{
     footage::{Footage, INPUTS, has_ending},
     recorded::recorded_cameras,
     take::{Calibration, Needs, Take, ready},
+    video_files::has_ending,
 };
 
 /// Source of a take.

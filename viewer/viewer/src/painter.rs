@@ -148,7 +148,7 @@ impl Shared {
 /// Content of a view: the request, and the number, stamp and colour count of each person. Equal content need not be drawn again.
 type Content = (Request, Vec<(u32, Stamp, u64)>);
 
-/// What is drawn into: the people, and the floor of the rig under them.
+/// Target of the drawing: the people, and the floor of the rig under them.
 #[derive(Debug, Default)]
 struct Stage {
     scene: Option<PeopleScene>,

@@ -76,7 +76,7 @@ pub struct Screenshot {
     pub height: u32,
     /// sRGB bytes, row by row.
     pub rgb: Vec<u8>,
-    /// What is missing; `None` for a person with all colours.
+    /// Missing part; `None` for a person with all colours.
     pub missing: Option<String>,
 }
 

@@ -32,7 +32,7 @@ const POINTS: usize = 8000;
 const DARKEST: f64 = 0.65;
 
 /// Floor at z = 0, a disc, and the surface that casts a shadow on it.
-pub(super) struct Floor {
+pub(super) struct FloorDisc {
     middle: DVec2,
     radius_m: f64,
     body: Template,
@@ -41,7 +41,7 @@ pub(super) struct Floor {
     each_m2: f64,
 }
 
-impl Floor {
+impl FloorDisc {
     /// Returns a floor on which everything within `reach_m` of the middle stands.
     ///
     /// # Errors
@@ -174,8 +174,8 @@ mod tests {
 
     const SIZE: u32 = 120;
 
-    fn floor() -> Floor {
-        Floor::new(DVec2::ZERO, 1.0, default_template(&ShapeParams::default()).unwrap()).unwrap()
+    fn floor() -> FloorDisc {
+        FloorDisc::new(DVec2::ZERO, 1.0, default_template(&ShapeParams::default()).unwrap()).unwrap()
     }
 
     fn camera(eye: DVec3) -> Camera {

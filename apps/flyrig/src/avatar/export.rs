@@ -11,7 +11,7 @@ use flyrig_report::{png, write_whole};
 use flyrig_types::PoseTrack;
 use glam::{DQuat, Quat};
 
-use super::{inputs::load, motion::Motion};
+use super::{inputs::load, motion::DrivenMotion};
 
 /// Arguments of `flyrig avatar export`.
 #[derive(Debug, Args)]
@@ -79,7 +79,7 @@ fn encode(atlas: &Atlas) -> Result<Vec<u8>> {
 fn mesh(avatar: &Avatar, args: &AvatarExportArgs) -> Result<()> {
     let texture = encode(&avatar.atlas(args.resolution.side)?)?;
     let mut surface = avatar.surface();
-    let motion = args.motion.as_deref().map(|motion| Motion::load(&surface, motion)).transpose()?;
+    let motion = args.motion.as_deref().map(|motion| DrivenMotion::load(&surface, motion)).transpose()?;
     let track = motion.map(|motion| y_up(motion.track())).transpose()?;
     surface.normals = avatar.template.normals_at(&surface.positions);
     write_glb(&args.out, &surface, GlbContents { track: track.as_ref(), texture: Some(&texture) })?;
@@ -105,7 +105,7 @@ fn y_up(track: &PoseTrack) -> Result<PoseTrack> {
 fn splats(avatar: &Avatar, args: &AvatarExportArgs, ending: &str) -> Result<()> {
     let pose = match &args.motion {
         Some(motion) => {
-            let motion = Motion::load(&avatar.surface(), motion)?;
+            let motion = DrivenMotion::load(&avatar.surface(), motion)?;
             motion.check(args.frame)?;
             motion.pose(args.frame)
         }

@@ -17,7 +17,7 @@ const NEAREST_M: f64 = 0.3;
 
 /// Place of the camera. World: metres, z up, the floor at 0, the middle of the person's path at the origin.
 #[derive(Debug, Clone, Default, Args)]
-pub struct ViewArgs {
+pub struct FramingArgs {
     /// Place of the camera X,Y,Z, metres: z up from the floor, the middle of the motion at 0,0, its front at negative y. Without it,
     /// the camera stands in front, where it sees the person in every frame.
     #[arg(long, value_parser = parse_place, allow_hyphen_values = true)]
@@ -81,7 +81,7 @@ impl PartBoxes {
 
 /// Camera that may walk around its target.
 #[derive(Debug)]
-pub(super) struct View {
+pub(super) struct ClipView {
     size: [u32; 2],
     eye: DVec3,
     pub target: DVec3,
@@ -90,12 +90,12 @@ pub(super) struct View {
     pub reach_m: f64,
 }
 
-impl View {
+impl ClipView {
     /// Places the camera for a clip: the corners of the person's parts, frame by frame, in the world, metres.
     ///
     /// # Errors
     /// `--eye` and `--target` are the same place.
-    pub fn new(args: &ViewArgs, size: [u32; 2], clip: &[Vec<DVec3>]) -> Result<Self> {
+    pub fn new(args: &FramingArgs, size: [u32; 2], clip: &[Vec<DVec3>]) -> Result<Self> {
         let all = || clip.iter().flatten().copied().filter(|corner| corner.is_finite());
         let (low, high) = all().fold((DVec3::INFINITY, DVec3::NEG_INFINITY), |(a, b), at| (a.min(at), b.max(at)));
         let middle = if low.cmple(high).all() { (low + high) * 0.5 } else { DVec3::Z };
@@ -163,11 +163,11 @@ mod tests {
 
     use flyrig_body::{ShapeParams, default_template, skin_mesh};
 
-    use super::{super::motion::Motion, *};
+    use super::{super::motion::DrivenMotion, *};
 
-    fn clip(name: &str) -> (Template, Motion, Vec<Vec<DVec3>>) {
+    fn clip(name: &str) -> (Template, DrivenMotion, Vec<Vec<DVec3>>) {
         let body = default_template(&ShapeParams::default()).unwrap();
-        let motion = Motion::load(&body, Path::new(name)).unwrap();
+        let motion = DrivenMotion::load(&body, Path::new(name)).unwrap();
         let boxes = PartBoxes::new(&body);
         let corners =
             (0..motion.frames()).map(|frame| boxes.corners(&body.skeleton, &motion.pose(frame))).collect::<Vec<_>>();
@@ -179,8 +179,8 @@ mod tests {
         for name in ["walk", "jump", "lie", "cross-arms"] {
             let (body, motion, corners) = clip(name);
             for (size, turn) in [([512, 768], 0.0), ([640, 360], 0.0), ([512, 512], 360.0), ([512, 768], -75.0)] {
-                let args = ViewArgs { turn, ..ViewArgs::default() };
-                let view = View::new(&args, size, &corners).unwrap();
+                let args = FramingArgs { turn, ..FramingArgs::default() };
+                let view = ClipView::new(&args, size, &corners).unwrap();
                 let mut filled = 0.0f64;
                 for frame in (0..motion.frames()).step_by(5) {
                     let camera = view.camera(frame as f64 / motion.frames() as f64);
@@ -202,22 +202,22 @@ mod tests {
     fn a_chosen_place_is_kept_and_what_it_cuts_off_is_counted() {
         let (_, _, corners) = clip("walk");
         let eye = DVec3::new(1.5, 2.0, 1.7);
-        let args = |eye: DVec3, turn: f64| ViewArgs { eye: Some(eye), target: Some(DVec3::Z), turn };
-        let view = View::new(&args(eye, 180.0), [200, 300], &corners).unwrap();
+        let args = |eye: DVec3, turn: f64| FramingArgs { eye: Some(eye), target: Some(DVec3::Z), turn };
+        let view = ClipView::new(&args(eye, 180.0), [200, 300], &corners).unwrap();
         assert!(view.camera(0.0).position().distance(eye) < 1e-9);
         assert!(view.camera(1.0).position().distance(DVec3::new(-1.5, -2.0, 1.7)) < 1e-9);
         // Counter-clockwise from above.
         assert!(view.camera(0.5).position().x < -1.9);
         let cut = view.cut_off(&corners);
         assert!(cut > corners.len() / 4, "{cut} of {}", corners.len());
-        let far = View::new(&args(eye * 20.0, 0.0), [200, 300], &corners).unwrap();
+        let far = ClipView::new(&args(eye * 20.0, 0.0), [200, 300], &corners).unwrap();
         assert_eq!(far.cut_off(&corners), 0);
-        let error = View::new(&args(DVec3::Z, 0.0), [200, 300], &corners).unwrap_err().to_string();
+        let error = ClipView::new(&args(DVec3::Z, 0.0), [200, 300], &corners).unwrap_err().to_string();
         assert_eq!(error, "--eye and --target are the same place; move one of them");
         // Straight down from above, and a clip of nothing that is finite.
-        let above = View::new(&args(DVec3::Z * 9.0, 90.0), [200, 300], &corners).unwrap();
+        let above = ClipView::new(&args(DVec3::Z * 9.0, 90.0), [200, 300], &corners).unwrap();
         assert!(above.camera(0.3).camera_from_world.is_finite());
-        let nothing = View::new(&ViewArgs::default(), [200, 300], &[vec![DVec3::NAN], vec![]]).unwrap();
+        let nothing = ClipView::new(&FramingArgs::default(), [200, 300], &[vec![DVec3::NAN], vec![]]).unwrap();
         assert!(nothing.camera(0.0).position().is_finite());
     }
 

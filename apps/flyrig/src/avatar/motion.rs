@@ -12,13 +12,13 @@ pub(super) const FPS: f64 = 30.0;
 
 /// Motion of an avatar: z up, the floor at z = 0, the middle of its path at the origin.
 #[derive(Debug)]
-pub(super) struct Motion {
+pub(super) struct DrivenMotion {
     /// File or name, for messages.
     what: String,
     track: PoseTrack,
 }
 
-impl Motion {
+impl DrivenMotion {
     /// Retargets a recorded motion (BVH or glTF file), or a generated one (its name), to the surface of an avatar.
     ///
     /// # Errors
@@ -112,7 +112,7 @@ mod tests {
         for (name, kind) in MotionKind::CLIPS {
             let parsed: flyrig_sim::SimConfig = toml::from_str(&format!("[motion]\nkind = \"{name}\"")).unwrap();
             assert_eq!(parsed.motion.kind, kind, "{name}");
-            let motion = Motion::load(&body, Path::new(name)).unwrap();
+            let motion = DrivenMotion::load(&body, Path::new(name)).unwrap();
             assert!(motion.frames() > 30, "{name}: {} frames", motion.frames());
             let heights: Vec<f32> = (0..motion.frames())
                 .step_by(7)
@@ -134,12 +134,12 @@ mod tests {
     #[test]
     fn frames_and_names_that_do_not_exist_are_refused_with_those_that_do() {
         let body = default_template(&ShapeParams::default()).unwrap();
-        let motion = Motion::load(&body, Path::new("turn")).unwrap();
+        let motion = DrivenMotion::load(&body, Path::new("turn")).unwrap();
         assert_eq!(motion.frames(), 301);
         motion.check(300).unwrap();
         let error = motion.check(301).unwrap_err().to_string();
         assert_eq!(error, "frame 301 is past the end: turn has 301 frames at 30 per second, 0 to 300");
-        let error = Motion::load(&body, Path::new("wlk")).unwrap_err().to_string();
+        let error = DrivenMotion::load(&body, Path::new("wlk")).unwrap_err().to_string();
         assert!(
             error.starts_with(
                 "no motion is called wlk; name a file (*.bvh, *.glb, *.gltf) or one of still, turn, walk,"

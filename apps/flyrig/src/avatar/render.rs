@@ -18,10 +18,10 @@ use flyrig_types::{Camera, Pose, RenderedView};
 use glam::DVec3;
 
 use super::{
-    backdrop::Floor,
-    framing::{PartBoxes, View, ViewArgs},
+    backdrop::FloorDisc,
+    framing::{ClipView, FramingArgs, PartBoxes},
     inputs::{load, print_far},
-    motion::{Motion, nanos},
+    motion::{DrivenMotion, nanos},
 };
 use crate::video_file::VideoFile;
 
@@ -43,20 +43,20 @@ pub struct AvatarRenderArgs {
     #[arg(long, default_value = "512x768", value_parser = parse_size)]
     pub size: [u32; 2],
     #[command(flatten)]
-    pub view: ViewArgs,
+    pub view: FramingArgs,
 }
 
 /// Runs `render`.
 pub fn render(args: &AvatarRenderArgs, gpu: &GpuContext) -> Result<()> {
     let avatar = load(&args.avatar)?;
     let surface = avatar.surface();
-    let motion = Motion::load(&surface, &args.motion)?;
+    let motion = DrivenMotion::load(&surface, &args.motion)?;
     let frames = args.frames.clone().unwrap_or(0..motion.frames());
     motion.check(frames.end - 1)?;
     let poses: Vec<Pose> = frames.clone().map(|frame| motion.pose(frame)).collect();
     let boxes = PartBoxes::new(&surface);
     let clip: Vec<Vec<DVec3>> = poses.iter().map(|pose| boxes.corners(&surface.skeleton, pose)).collect();
-    let view = View::new(&args.view, args.size, &clip)?;
+    let view = ClipView::new(&args.view, args.size, &clip)?;
     let mut out = Output::create(&args.out, args.size, &view, surface)?;
     let mut scene = DetailedScene::new(gpu, avatar, true)?;
     let bar = progress_bar(poses.len() as u64, "avatar render");
@@ -94,16 +94,16 @@ enum Output {
     /// Folder of images with a transparent background.
     Images(PathBuf),
     /// Video on a floor.
-    Video { file: VideoFile, floor: Box<Floor> },
+    Video { file: VideoFile, floor: Box<FloorDisc> },
 }
 
 impl Output {
     /// Creates the folder or the video. `surface` casts the shadow.
-    fn create(path: &Path, [width, height]: [u32; 2], view: &View, surface: Template) -> Result<Self> {
+    fn create(path: &Path, [width, height]: [u32; 2], view: &ClipView, surface: Template) -> Result<Self> {
         let ending = path.extension().map(|ending| ending.to_string_lossy().to_lowercase()).unwrap_or_default();
         match ending.as_str() {
             "mp4" | "avi" => Ok(Self::Video {
-                floor: Box::new(Floor::new(view.target.truncate(), view.reach_m, surface)?),
+                floor: Box::new(FloorDisc::new(view.target.truncate(), view.reach_m, surface)?),
                 file: VideoFile::create(path, (width, height))?,
             }),
             "mov" | "mkv" | "webm" | "m4v" | "png" | "jpg" | "jpeg" => bail!(

@@ -75,7 +75,7 @@ impl Lenses {
     /// Returns all lenses.
     ///
     /// # Errors
-    /// What is missing for each camera without one.
+    /// Missing part for each camera without one.
     pub fn all(&self) -> Result<Vec<Intrinsics>> {
         let missing: Vec<String> =
             self.by_slot.iter().filter_map(|lens| Some(format!("{:#}", lens.as_ref().err()?))).collect();

@@ -20,7 +20,7 @@ const OUTLINE_BAD: f64 = 0.02;
 /// 18 dB, with torn hands and legs.
 const PSNR_GOOD_DB: f64 = 22.0;
 const PSNR_BAD_DB: f64 = 19.0;
-/// The same among the input views of one reconstruction, beyond which they contradict each other, and the share of it below which a camera
+/// Difference among the input views of one reconstruction, beyond which they contradict each other, and the share of it below which a camera
 /// less makes them agree.
 const INNER_GOOD: f64 = 0.004;
 const CLEARLY: f64 = 0.6;
@@ -52,14 +52,14 @@ pub struct CameraCheck {
     light: [f64; 2],
 }
 
-/// What one camera's images say about it.
+/// Verdict of one camera's images.
 #[derive(Debug, Clone, PartialEq, Serialize)]
 pub struct Verdict {
     pub camera: String,
     pub grade: Grade,
     /// Distance of our outline from the mask's, pixels; `None` without a mask.
     pub outline_px: Option<f64>,
-    /// The same relative to the height of the person in the image.
+    /// Distance relative to the height of the person in the image.
     pub outline_share: Option<f64>,
     /// Whether that distance follows the motion, as a time offset does, rather than being constant.
     pub follows_motion: bool,

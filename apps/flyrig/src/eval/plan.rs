@@ -16,14 +16,14 @@ pub struct Split {
 
 /// Reconstructions of an evaluation.
 #[derive(Debug, PartialEq, Eq)]
-pub struct Plan {
+pub struct EvalPlan {
     /// The first one is shown in film, page and input views.
     pub splits: Vec<Split>,
     /// How the cameras are evaluated, and what that means.
     pub method: String,
 }
 
-impl Plan {
+impl EvalPlan {
     /// Plans the evaluation of these input cameras, with cameras that are held out by name.
     pub fn new(inputs: &[String], holdout: &[String]) -> Self {
         let inputs = inputs.to_vec();
@@ -98,7 +98,7 @@ mod tests {
 
     #[test]
     fn four_cameras_are_held_out_in_turn_and_never_see_themselves() {
-        let plan = Plan::new(&names(4), &[]);
+        let plan = EvalPlan::new(&names(4), &[]);
         assert_eq!(plan.splits.len(), 5);
         assert_eq!((plan.splits[0].inputs.len(), plan.splits[0].holdout.len()), (4, 0));
         assert_eq!(plan.held_out(), names(4));
@@ -112,11 +112,11 @@ mod tests {
     #[test]
     fn fewer_cameras_say_what_is_possible_and_many_are_sampled() {
         for (count, word) in [(1, "One camera"), (2, "Two cameras"), (3, "Three cameras")] {
-            let plan = Plan::new(&names(count), &[]);
+            let plan = EvalPlan::new(&names(count), &[]);
             assert_eq!(plan.splits.len(), 1);
             assert!(plan.method.starts_with(word) && plan.method.contains("no number"), "{}", plan.method);
         }
-        let plan = Plan::new(&names(23), &[]);
+        let plan = EvalPlan::new(&names(23), &[]);
         assert_eq!(plan.splits.len(), 1 + MOST_IN_TURN);
         assert!(plan.method.starts_with("8 of 23 cameras were held out in turn (01, 03,"), "{}", plan.method);
         assert_eq!(evenly(9, 8), [0, 1, 2, 3, 4, 5, 6, 7]);
@@ -124,7 +124,7 @@ mod tests {
 
     #[test]
     fn named_cameras_are_held_out_together() {
-        let plan = Plan::new(&names(2), &["07".to_owned(), "08".to_owned()]);
+        let plan = EvalPlan::new(&names(2), &["07".to_owned(), "08".to_owned()]);
         assert_eq!(plan.splits, [Split { inputs: names(2), holdout: vec!["07".to_owned(), "08".to_owned()] }]);
         assert!(plan.method.contains("07, 08") && plan.method.contains("01, 02"), "{}", plan.method);
     }

@@ -9,11 +9,11 @@ use serde::Serialize;
 use super::{
     arguments::EvalArgs,
     checks::{Culprit, Verdict},
-    plan::Plan,
+    plan::EvalPlan,
     run::{Evaluation, Run},
 };
 
-/// What the numbers of the table mean.
+/// Meaning of the numbers in the table.
 const FLIP: &str = "FLIP is the share of the picture that seems to change when one flips between the camera's image and ours, 0 to 1: below \
     0.1 one has to look for it. PSNR (dB) and SSIM compare the pixels: higher is better.";
 
@@ -51,7 +51,7 @@ pub struct Metrics<'a> {
 
 impl<'a> Metrics<'a> {
     /// Collects the numbers. Counts and run times are those of the first run.
-    pub fn new(args: &'a EvalArgs, plan: &Plan, evaluation: &'a Evaluation, first: &Run, seconds: f64) -> Self {
+    pub fn new(args: &'a EvalArgs, plan: &EvalPlan, evaluation: &'a Evaluation, first: &Run, seconds: f64) -> Self {
         let perception = &args.take.perception.settings;
         let cameras = evaluation.sheet.per_camera();
         Self {
@@ -82,7 +82,7 @@ impl<'a> Metrics<'a> {
     }
 
     /// Returns the sentences about the take: what was done, each camera, and the next step.
-    pub fn sentences(&self, args: &EvalArgs, plan: &Plan, evaluation: &Evaluation) -> Vec<String> {
+    pub fn sentences(&self, args: &EvalArgs, plan: &EvalPlan, evaluation: &Evaluation) -> Vec<String> {
         let mut sentences = Vec::new();
         if let Some(mean) = &self.mean {
             sentences.push(format!(
@@ -103,7 +103,13 @@ impl<'a> Metrics<'a> {
     }
 
     /// Builds the report.
-    pub fn report(&self, args: &EvalArgs, plan: &Plan, evaluation: &Evaluation, contact: Vec<ContactRow>) -> Report {
+    pub fn report(
+        &self,
+        args: &EvalArgs,
+        plan: &EvalPlan,
+        evaluation: &Evaluation,
+        contact: Vec<ContactRow>,
+    ) -> Report {
         let held_out = if self.holdout.is_empty() { "none".to_owned() } else { self.holdout.join(" ") };
         let turn = if self.in_turn { ", in turn" } else { "" };
         let facts = [

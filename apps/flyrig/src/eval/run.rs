@@ -20,7 +20,7 @@ use flyrig_types::{Camera, CameraId, Frame, FrameSet, Mask, RenderedView};
 use indicatif::ProgressBar;
 use rayon::prelude::*;
 
-use super::{checks::CameraCheck, shown::Shown};
+use super::{checks::CameraCheck, shown::TakeShow};
 
 /// Frame sets from one written surface to the next.
 const SURFACE_EVERY: u64 = 10;
@@ -89,7 +89,7 @@ impl Evaluation {
     ///
     /// # Errors
     /// Those of the take, the adapter and the disk.
-    pub fn run(&mut self, runs: &mut [Run], shown: &mut Shown) -> Result<()> {
+    pub fn run(&mut self, runs: &mut [Run], shown: &mut TakeShow) -> Result<()> {
         self.create_folders(runs)?;
         let all = runs.iter().map(|run| run.replay.count as u64).sum();
         let mut progress =
@@ -117,7 +117,7 @@ impl Evaluation {
     }
 
     /// Processes a frame set of a run.
-    fn step(&mut self, index: usize, run: &mut Run, set: &FrameSet, shown: &mut Shown) -> Result<()> {
+    fn step(&mut self, index: usize, run: &mut Run, set: &FrameSet, shown: &mut TakeShow) -> Result<()> {
         let number = frame_number(set);
         if let Outcome::Held(reason) = run.replay.session.process(set)? {
             tracing::warn!(frame = number, %reason, "frame not used");

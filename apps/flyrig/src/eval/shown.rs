@@ -15,7 +15,7 @@ use crate::orbit_film::{Extent, OrbitFilm};
 const COLORS: ColorSettings = ColorSettings { step: 6.0, refresh_secs: 1.0, max_frame_bytes: 4 << 20 };
 
 /// Page and film under way.
-pub struct Shown {
+pub struct TakeShow {
     page: TakePage,
     film: Option<OrbitFilm>,
     /// Hash of the template and encoder of each person.
@@ -25,7 +25,7 @@ pub struct Shown {
     epoch: u32,
 }
 
-impl Shown {
+impl TakeShow {
     /// Starts a page, and a film if its file is named.
     ///
     /// # Errors

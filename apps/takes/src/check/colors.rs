@@ -20,7 +20,7 @@ const PAYS: f64 = 0.9;
 /// Least relative change of a gain for which colours are adopted.
 const LEAST_GAIN: f64 = 0.03;
 
-/// What the person tells of colours.
+/// Colours that the person tells.
 pub(super) struct ColorFinding {
     /// Corrections, one per slot.
     pub colors: Vec<ColorMatch>,

@@ -8,10 +8,10 @@ use flyrig_report::write_whole;
 use flyrig_types::Rig;
 use serde_json::{Value, json};
 
-use super::Checked;
+use super::checked::Checked;
 use crate::dataset;
 
-/// What a check found, and of which calibration.
+/// Figures of a check, with the calibration that was checked.
 const CHECK: &str = "calibration.check.json";
 /// The calibration before the first check.
 const BEFORE: &str = "calibration.before.toml";
@@ -40,8 +40,11 @@ pub(super) fn ensure_writable(root: &Path) -> Result<()> {
     Ok(std::fs::remove_file(&probe)?)
 }
 
-/// Writes what a check found, and the calibration where it changed.
-pub(super) fn save(root: &Path, checked: &Checked) -> Result<()> {
+/// Writes the figures of a check into a take, and the calibration where it changed; the one that it replaces stays beside it.
+///
+/// # Errors
+/// Names the file that cannot be written.
+pub fn save_checked(root: &Path, checked: &Checked) -> Result<()> {
     if checked.is_changed {
         let (now, before) = (root.join(CALIBRATION), root.join(BEFORE));
         if now.exists() && !before.exists() {

@@ -6,7 +6,7 @@ use flyrig_types::{Image, Rig};
 use rayon::prelude::*;
 use serde_json::{Value, json};
 
-use super::Instants;
+use super::stretches::Stretches;
 use crate::{
     person_tracks::{PersonFinder, ensure_same_person, fit_person},
     take::{Take, TakeSpan},
@@ -23,7 +23,7 @@ const LEAST_MOVED: f64 = 0.002;
 /// Standard deviations of poses that stay: radians and metres.
 const FIXED: f64 = 1e-5;
 
-/// What the person tells of time offsets and poses.
+/// Time offsets and poses that the person tells.
 pub(super) struct Finding {
     /// The chosen calibration with what was adopted.
     pub rig: Rig,
@@ -66,7 +66,7 @@ impl Finding {
 }
 
 /// Measures time offsets and poses. `rigs` are the possible calibrations.
-pub(super) fn measure(rigs: &[Rig], plates: Vec<Option<Image>>, take: Take, instants: &Instants) -> Result<Finding> {
+pub(super) fn measure(rigs: &[Rig], plates: Vec<Option<Image>>, take: Take, instants: &Stretches) -> Result<Finding> {
     let first = rigs.first().context("no calibration")?;
     let mut finder = PersonFinder::new(rigs, plates)?;
     let (mut chosen, mut begin) = (instants.clone(), None);

@@ -3,11 +3,12 @@
 //! Each is measured on the person and adopted only where silhouettes and colours that were kept back agree better with it. The result
 //! lies in the take: `calibration.toml`, the old one beside it, and `calibration.check.json`, which says what was found.
 
+mod checked;
 mod colors;
 mod files;
 mod geometry;
-mod instants;
 mod sentences;
+mod stretches;
 
 use std::path::Path;
 
@@ -17,13 +18,16 @@ use flyrig_sync::SyncSettings;
 use flyrig_types::{Image, Rig};
 use serde_json::json;
 
-pub use self::files::mark_checked;
+pub use self::{
+    checked::{CheckInput, Checked},
+    files::{mark_checked, save_checked},
+};
 use self::{
     colors::{ColorFinding, match_take},
-    files::{is_checked, save},
+    files::is_checked,
     geometry::{Finding, measure},
-    instants::Instants,
     sentences::sentences,
+    stretches::Stretches,
 };
 use crate::{
     dataset,
@@ -32,42 +36,6 @@ use crate::{
     take::{Calibration, Take},
 };
 use flyrig_capture::FolderOptions;
-
-/// Footage whose calibration is checked.
-pub struct CheckInput<'a> {
-    /// Footage with images of all cameras.
-    pub footage: &'a Footage,
-    /// Frame rate of a folder of images, frames per second.
-    pub fps: f64,
-    /// Calibrations that are possible, at least one; the first is the take's own.
-    pub rigs: &'a [Rig],
-    /// Images of the empty scene, one per slot.
-    pub plates: Vec<Option<Image>>,
-}
-
-/// Result of a check.
-#[derive(Debug, Clone)]
-pub struct Checked {
-    /// Calibration with what was adopted.
-    pub rig: Rig,
-    /// Which of the possible calibrations fits best.
-    pub choice: usize,
-    /// Whether the calibration differs from the chosen one.
-    pub is_changed: bool,
-    /// What was wrong, for the user.
-    pub sentences: Vec<String>,
-    report: serde_json::Value,
-}
-
-impl Checked {
-    /// Writes the calibration into a take, the one that it replaces beside it.
-    ///
-    /// # Errors
-    /// Names the file that cannot be written.
-    pub fn save(&self, root: &Path) -> Result<()> {
-        save(root, self)
-    }
-}
 
 /// Checks the calibration of a take folder that was never checked, adopts what agrees better, and prints what was wrong. A folder that
 /// cannot be written, a single camera, and a person who tells nothing leave the calibration as it is, with a line that says so.
@@ -103,7 +71,7 @@ pub fn check_take(root: &Path, fps: f64, gpu: &dyn Fn() -> Result<GpuContext>) -
                 found.unwrap_or(camera).clone()
             });
             checked.rig = Rig { cameras: kept.collect(), world_up: all.world_up };
-            checked.save(root)
+            save_checked(root, &checked)
         }
         Err(error) => {
             eprintln!("the calibration could not be checked and is used as it is: {error:#}");
@@ -122,7 +90,7 @@ pub fn check(input: CheckInput<'_>, gpu: &dyn Fn() -> Result<GpuContext>) -> Res
     let cameras: Vec<_> = first.cameras.iter().map(|camera| camera.id.clone()).collect();
     let options = FolderOptions { fps, ..FolderOptions::default() };
     let secs = footage.open(Some(&cameras), &options)?.secs;
-    let instants = Instants::spread(secs, cameras.len());
+    let stretches = Stretches::spread(secs, cameras.len());
     let open = |rig: &Rig| -> Result<Take> {
         let take =
             Take::open(&TakeInput::Footage(footage.clone()), &TakeOptions { fps, ..TakeOptions::default() }, &|| {
@@ -136,7 +104,7 @@ pub fn check(input: CheckInput<'_>, gpu: &dyn Fn() -> Result<GpuContext>) -> Res
             ..Take { sources: Vec::new(), ..take }
         })
     };
-    let finding = measure(rigs, copies(&plates)?, open(first)?, &instants)?;
+    let finding = measure(rigs, copies(&plates)?, open(first)?, &stretches)?;
     let colors = match_take(&finding.rig, &plates, &|| open(&finding.rig), gpu()?).unwrap_or_else(|error| {
         tracing::debug!(%error, "the colours could not be matched");
         ColorFinding::none(&finding.rig)

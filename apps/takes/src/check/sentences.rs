@@ -1,8 +1,8 @@
-//! What was wrong, in a few sentences.
+//! Faults of a calibration in a few sentences.
 
 use flyrig_types::{ColorMatch, Rig};
 
-use super::{ColorFinding, Finding};
+use super::{colors::ColorFinding, geometry::Finding};
 
 /// Weights of red, green and blue in the light that a person sees.
 const LUMA: [f64; 3] = [0.2126, 0.7152, 0.0722];

@@ -7,9 +7,9 @@ use flyrig_calib::Format;
 use flyrig_types::{CameraId, Rig};
 
 use super::{
-    ImportOptions,
     footage::{FoundFootage, subfolders},
     names::same_camera,
+    options::ImportOptions,
 };
 
 /// Calibration of another program, or flyrig's own.
@@ -17,7 +17,7 @@ pub(super) struct FoundCalibration {
     pub rig: Rig,
     /// Whether the file states the up direction.
     pub up_is_stated: bool,
-    /// What was found and assumed, for the user.
+    /// Findings and assumptions, for the user.
     pub notes: Vec<String>,
 }
 

@@ -5,7 +5,7 @@ use std::path::{Path, PathBuf};
 use anyhow::{Context as _, Result, ensure};
 
 use super::footage::{FoundCamera, FoundFootage, files_of};
-use crate::footage::has_ending;
+use crate::video_files::has_ending;
 
 /// Writer of a new take, which is removed again unless it is finished.
 pub(super) struct TakeWriter {

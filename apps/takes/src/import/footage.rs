@@ -9,7 +9,7 @@ use anyhow::{Context as _, Result, bail, ensure};
 use flyrig_capture::{VideoOptions, VideoReplay, read_image};
 use flyrig_types::CameraId;
 
-use crate::footage::{VIDEO_ENDINGS, has_ending, is_video};
+use crate::video_files::{VIDEO_ENDINGS, has_ending, is_video};
 
 /// Endings of image files.
 const IMAGE_ENDINGS: [&str; 3] = ["jpg", "jpeg", "png"];

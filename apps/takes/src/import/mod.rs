@@ -4,47 +4,29 @@ mod calibration;
 mod files;
 mod footage;
 mod names;
+mod options;
 
-use std::path::{Path, PathBuf};
+use std::path::Path;
 
 use anyhow::{Context as _, Result, ensure};
-use flyrig_calib::{Fit, Format, resize_lens};
+use flyrig_calib::{Crop, Format, resize_lens};
 use flyrig_gpu::GpuContext;
 use flyrig_types::{CameraId, Rig};
 use glam::DVec3;
 
-pub use self::names::parse_pair;
 use self::{
     calibration::{FoundCalibration, find_calibration},
     files::TakeWriter,
     footage::FoundFootage,
     names::matched,
 };
+pub use self::{names::parse_pair, options::ImportOptions};
 use crate::{
-    check::{CheckInput, check, mark_checked},
+    check::{CheckInput, check, mark_checked, save_checked},
     dataset,
     footage::Footage,
     person_up::person_up,
 };
-
-/// What is imported, and how.
-#[derive(Debug, Clone)]
-pub struct ImportOptions {
-    /// One folder, or the videos of all cameras.
-    pub inputs: Vec<PathBuf>,
-    /// File or folder of a calibration; searched for otherwise.
-    pub calibration: Option<PathBuf>,
-    /// Length of the calibration's unit, metres.
-    pub scale: f64,
-    /// Names of cameras in the footage, and in the calibration.
-    pub names: Vec<(String, String)>,
-    /// New folder of the take.
-    pub out: PathBuf,
-    /// Frame rate of a folder of images, frames per second.
-    pub fps: f64,
-    /// Whether the calibration is taken as it is.
-    pub trusts_calibration: bool,
-}
 
 /// Imports footage with its calibration as a take, and prints what was found, assumed and corrected.
 ///
@@ -74,7 +56,7 @@ pub fn import(options: &ImportOptions, gpu: &dyn Fn() -> Result<GpuContext>) -> 
 /// two calibrations are possible.
 fn fit_sizes(found: &FoundFootage, calibration: &FoundCalibration, pairs: &[(usize, usize)]) -> Result<Vec<Rig>> {
     let mut rigs = Vec::new();
-    for fit in [Fit::Cropped, Fit::Extended] {
+    for crop in [Crop::Cropped, Crop::Extended] {
         let (mut cameras, mut is_certain) = (Vec::new(), true);
         for (slot, known) in pairs {
             let source = &found.cameras[*slot];
@@ -82,12 +64,12 @@ fn fit_sizes(found: &FoundFootage, calibration: &FoundCalibration, pairs: &[(usi
             let size = source.size()?;
             camera.id = CameraId::from(source.name.as_str());
             if size != (camera.intrinsics.width, camera.intrinsics.height) {
-                let (lens, resize) = resize_lens(&camera.intrinsics, size, fit)
+                let (lens, resize) = resize_lens(&camera.intrinsics, size, crop)
                     .map_err(|problem| anyhow::anyhow!("camera {}: {problem}", source.name))?;
                 camera.intrinsics = lens;
                 is_certain &= resize.is_scaled_only();
-                if fit == Fit::Cropped || !resize.is_scaled_only() {
-                    let or = if fit == Fit::Cropped { "" } else { "or, which the person decides: " };
+                if crop == Crop::Cropped || !resize.is_scaled_only() {
+                    let or = if crop == Crop::Cropped { "" } else { "or, which the person decides: " };
                     println!("{or}camera {}: {resize}", source.name);
                 }
             }
@@ -141,7 +123,7 @@ fn correct(options: &ImportOptions, rigs: &[Rig], gpu: &dyn Fn() -> Result<GpuCo
             }
             checked.sentences.iter().for_each(|sentence| println!("{sentence}"));
             Format::Flyrig.write(&options.out, &rigs[checked.choice])?;
-            checked.save(&options.out)?;
+            save_checked(&options.out, &checked)?;
             Ok(checked.rig)
         }
         Err(error) => {

@@ -7,7 +7,7 @@ use anyhow::{Result, bail};
 pub(super) struct Matched {
     /// Slots in the footage and in the calibration.
     pub pairs: Vec<(usize, usize)>,
-    /// What was assumed or left out, for the user.
+    /// Assumptions, and names that were left out, for the user.
     pub notes: Vec<String>,
 }
 

@@ -9,17 +9,17 @@ const RATE: f64 = 30.0;
 /// Part of a take in which frame sets are chosen, seconds: what lies behind need not be decoded.
 const REACH_S: f64 = 8.0;
 /// Number of stretches that the footage is spread over: time offsets need consecutive frames, poses need a person in several places.
-const STRETCHES: usize = 3;
+const COUNT: usize = 3;
 
 /// Stretches of consecutive frame sets.
 #[derive(Debug, Clone, PartialEq)]
-pub(super) struct Instants {
+pub(super) struct Stretches {
     /// Beginning and end of each stretch, seconds after the first frame set.
     stretches: Vec<(f64, f64)>,
     last: Option<f64>,
 }
 
-impl Instants {
+impl Stretches {
     /// Chooses stretches of a take of a duration (seconds, `None` if unknown) for a number of cameras.
     pub fn spread(secs: Option<f64>, cameras: usize) -> Self {
         let looked = (MOST_IMAGES / (RATE * cameras.max(1) as f64)).clamp(LOOKED_S.0, LOOKED_S.1);
@@ -27,9 +27,9 @@ impl Instants {
         if reach <= looked * 1.2 {
             return Self { stretches: vec![(0.0, reach.max(looked))], last: None };
         }
-        let each = looked / STRETCHES as f64;
-        let begin = |i: usize| (reach - each) * i as f64 / (STRETCHES - 1) as f64;
-        Self { stretches: (0..STRETCHES).map(|i| (begin(i), begin(i) + each)).collect(), last: None }
+        let each = looked / COUNT as f64;
+        let begin = |i: usize| (reach - each) * i as f64 / (COUNT - 1) as f64;
+        Self { stretches: (0..COUNT).map(|i| (begin(i), begin(i) + each)).collect(), last: None }
     }
 
     /// Returns the end of the last stretch, seconds.
@@ -54,7 +54,7 @@ mod tests {
     use super::*;
 
     fn chosen(secs: Option<f64>, cameras: usize, fps: f64, frames: u32) -> Vec<f64> {
-        let mut instants = Instants::spread(secs, cameras);
+        let mut instants = Stretches::spread(secs, cameras);
         (0..frames).map(|i| f64::from(i) / fps).filter(|secs| instants.is_chosen(*secs)).collect()
     }
 
