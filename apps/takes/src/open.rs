@@ -8,7 +8,7 @@ use flyrig_gpu::GpuContext;
 
 use crate::{
     configured::TakeConfig,
-    footage::{Footage, INPUTS, has_ending},
+    footage::{Footage, INPUTS},
     recorded::recorded_cameras,
     take::{Calibration, Needs, Take, ready},
     video_files::has_ending,

@@ -25,7 +25,7 @@ pub use self::{
 use self::{
     colors::{ColorFinding, match_take},
     files::is_checked,
-    geometry::{Finding, measure},
+    geometry::measure,
     sentences::sentences,
     stretches::Stretches,
 };
