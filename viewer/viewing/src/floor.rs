@@ -57,7 +57,7 @@ impl Floor {
         let reach = |eye: DVec3| ((eye - center) - up * (eye - center).dot(up)).length() as f32;
         let nearest = rig.cameras.iter().map(|camera| reach(camera.position())).fold(f32::INFINITY, f32::min);
         Self {
-            axes: [x, up.cross(x), up].map(|axis| axis.as_vec3()),
+            axes: [x, up.cross(x), up].map(DVec3::as_vec3),
             center: level.as_vec3(),
             radius: (RADIUS_SHARE * nearest).clamp(LEAST_RADIUS_M, MOST_RADIUS_M),
             level: None,

@@ -106,7 +106,7 @@ mod tests {
         assert_eq!(take.len(), 3 * 20 + 2 + 8 + 3);
         assert_eq!(take[..4], [0, 0, 0, 0]);
         assert_eq!((take[22], take[26]), (1, 7));
-        assert_eq!(f64::from_le_bytes(take[30..38].try_into().unwrap()), 0.5);
+        assert!((f64::from_le_bytes(take[30..38].try_into().unwrap()) - 0.5).abs() < 1e-12);
         assert_eq!(take[take.len() - 3..], [1, 2, 3]);
     }
 }

@@ -169,11 +169,9 @@ impl CameraCheck {
         }
         let late = steps.iter().map(|(velocity, by)| dot(*velocity, *by)).sum::<f64>() / speeds;
         let mean = [0, 1].map(|axis| steps.iter().map(|(_, by)| by[axis]).sum::<f64>() / count);
-        let left = |rest: &dyn Fn(&([f64; 2], [f64; 2])) -> [f64; 2]| -> f64 {
-            steps.iter().map(|step| dot(rest(step), rest(step))).sum()
-        };
-        let moving = left(&|(velocity, by)| minus(*by, velocity.map(|v| late * v)));
-        moving < left(&|(_, by)| minus(*by, mean))
+        let square = |rest: [f64; 2]| dot(rest, rest);
+        let moving: f64 = steps.iter().map(|(velocity, by)| square(minus(*by, velocity.map(|v| late * v)))).sum();
+        moving < steps.iter().map(|(_, by)| square(minus(*by, mean))).sum()
     }
 }
 

@@ -112,8 +112,8 @@ impl Evaluation {
         let create =
             |path: PathBuf| std::fs::create_dir_all(&path).with_context(|| format!("cannot create {}", path.display()));
         create(self.out.join("surface"))?;
-        let held_out = runs.iter().flat_map(|run| &run.replay.holdout);
-        held_out.map(|camera| create(self.out.join(camera.id.as_str()))).collect()
+        let mut held_out = runs.iter().flat_map(|run| &run.replay.holdout);
+        held_out.try_for_each(|camera| create(self.out.join(camera.id.as_str())))
     }
 
     /// Processes a frame set of a run.

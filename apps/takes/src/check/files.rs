@@ -23,7 +23,7 @@ const CALIBRATION: &str = "calibration.toml";
 /// The calibration cannot be read, or the file cannot be written.
 pub fn mark_checked(root: &Path) -> Result<()> {
     let rig = dataset::load_rig(root, &[])?;
-    write(root, &rig, Value::Null, &[])
+    write(root, &rig, &Value::Null, &[])
 }
 
 /// Returns whether this calibration of a take was checked.
@@ -54,10 +54,10 @@ pub fn save_checked(root: &Path, checked: &Checked) -> Result<()> {
     }
     // As the file has it, rounded.
     let rig = if root.join(CALIBRATION).exists() { dataset::load_rig(root, &[])? } else { checked.rig.clone() };
-    write(root, &rig, checked.report.clone(), &checked.sentences)
+    write(root, &rig, &checked.report, &checked.sentences)
 }
 
-fn write(root: &Path, rig: &Rig, report: Value, sentences: &[String]) -> Result<()> {
+fn write(root: &Path, rig: &Rig, report: &Value, sentences: &[String]) -> Result<()> {
     let file = json!({ "calibration": calibration_toml(rig, &[])?, "sentences": sentences, "measured": report });
-    Ok(write_whole(&root.join(CHECK), &serde_json::to_vec_pretty(&file)?)?)
+    write_whole(&root.join(CHECK), &serde_json::to_vec_pretty(&file)?)
 }
