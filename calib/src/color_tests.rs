@@ -104,7 +104,10 @@ fn noise_and_highlights_leave_gains_within_a_percent() {
         let seen = points(&truth, 4000, 0.05, &mut dice);
         let fit = match_colors(&ids(8), &seen).unwrap();
         // The instants that were kept back agree as well as noise allows.
-        assert!(fit.kept_back < 0.1 && fit.kept_back < 0.3 * color_difference(&[ColorMatch::NONE; 8], &seen), "{fit:?}");
+        assert!(
+            fit.kept_back < 0.1 && fit.kept_back < 0.3 * color_difference(&[ColorMatch::NONE; 8], &seen),
+            "{fit:?}"
+        );
         // Of what is there, all is sought; more only where it says nothing.
         assert!(fit.model.response || !model.response);
         assert!(fit.model.falloff || !model.falloff);

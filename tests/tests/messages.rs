@@ -80,7 +80,7 @@ impl Inputs {
         let free = listen(self.free);
         self.write("right.toml", &format!("{source}{free}"));
         self.write("key.toml", &format!("{}{free}", source.replace("path", "pth")));
-        self.write("folder.toml", &format!("{}{free}", source.replace("take", "tkae")));
+        self.write("folder.toml", &format!("{}{free}", source.replace("take", "takke")));
         self.write("names.toml", &format!("{}{free}", source.replace("cameras = []\n", "")));
         self.write("plates.toml", &format!("{source}[perception]\nplates = \"plats\"\n{free}"));
         self.write("keys.toml", &format!("{source}{free}keys = \"studio-keys\"\n"));
@@ -161,7 +161,8 @@ fn a_configuration_without_its_calibration_yet_and_one_with_two_faults() {
     inputs.write("two.toml", &format!("{text}keys = \"studio-keys\"\n"));
     let checked = inputs.run_in("", &["config", "check", "two.toml"]);
     assert_eq!(checked.code, Some(1), "{checked:?}");
-    for part in ["error: 2 problems in the configuration two.toml", "tkae does not exist", "studio-keys does not exist"]
+    for part in
+        ["error: 2 problems in the configuration two.toml", "takke does not exist", "studio-keys does not exist"]
     {
         assert!(checked.stderr.contains(part), "{checked:?}");
     }
