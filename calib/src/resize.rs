@@ -5,8 +5,8 @@ use std::fmt;
 use flyrig_types::Intrinsics;
 use glam::DVec2;
 
-/// Difference between the sides' ratios, over an image's longer side, below which the images were only scaled, pixels.
-const SCALED_PX: f64 = 0.5;
+/// Margin below which images were only scaled, pixels: scaled sizes are rounded, to even numbers in videos.
+const SCALED_PX: f64 = 1.0;
 /// Largest ratio of two aspect ratios that cropping explains.
 const MOST_CROP: f64 = 1.5;
 
