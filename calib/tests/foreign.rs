@@ -309,6 +309,10 @@ fn the_field_of_view_of_qualisys_is_heeded_and_its_other_keys_named() {
         .replace("right=\"500\"", "right=\"499\"")
         .replace("bottom=\"480\"", "bottom=\"479\"");
     assert_eq!(camera(&last), camera(&cropped));
+    // The sensor ends at the first or at the last 64th of its last pixel.
+    let first = last.replace("40959.0", "40896.000000").replace("30719.000000", "30656").replace("30719.0", "30656");
+    assert_ne!(first, last);
+    assert_eq!(camera(&first), camera(&last));
     for (from, to, word) in [
         ("skew=\"0\"", "skew=\"64\"", "skew is 64"),
         ("viewrotation=\"0\"", "viewrotation=\"90\"", "viewrotation is 90"),
