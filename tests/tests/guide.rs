@@ -26,7 +26,7 @@ const PROGRAM: &str = env!("CARGO_BIN_EXE_flyrig-under-test");
 const SEEN_SIM: &str = "width = 160\nheight = 160\ntexture_px = 256\n";
 
 /// Lengths and cameras in the guide, and those of the test.
-const SHORTER: [(&str, &str); 10] = [
+const SHORTER: [(&str, &str); 12] = [
     ("--seconds 60", "--seconds 2"),
     ("--seconds 20", "--seconds 2"),
     ("--seconds 10", "--seconds 2"),
@@ -38,6 +38,9 @@ const SHORTER: [(&str, &str); 10] = [
     // The simulated cameras have numbers.
     ("--inputs left,right,back --holdout front", "--inputs 00,01,02 --holdout 03"),
     ("--inputs left,right --holdout back", "--inputs 00,02 --holdout 01"),
+    // Each camera in turn takes minutes, and the simulated cameras stand far apart.
+    ("eval take.mcap", "eval take.mcap --inputs 00,02 --holdout 01"),
+    ("--size 1080x1080", "--size 108x108"),
 ];
 
 fn root() -> PathBuf {
@@ -91,7 +94,7 @@ fn every_page_is_followed_or_marked() {
     }
 }
 
-/// Takes and files that a reader has, made once: `DATASET` of five simulated cameras and a small rig.
+/// Takes and files that a reader has, made once: `DATASET` and `TAKE` of five simulated cameras, and a small rig.
 fn supplies() -> &'static Path {
     static FOLDER: OnceLock<tempfile::TempDir> = OnceLock::new();
     let folder = FOLDER.get_or_init(|| {
@@ -111,7 +114,10 @@ fn supplies() -> &'static Path {
         done(folder.path(), &[&convert[..], &["calibration"]].concat());
         done(folder.path(), &[&convert[..], &["nerf", "--to", "nerfstudio"]].concat());
         fs::rename(at("nerf/transforms.json"), at("transforms.json")).unwrap();
-        fs::write(at("walk.bvh"), walk_bvh()).unwrap();
+        for name in ["walk.bvh", "dance.bvh"] {
+            fs::write(at(name), walk_bvh()).unwrap();
+        }
+        copy_folder(&at("DATASET"), &at("TAKE")).unwrap();
         fs::remove_file(at("sim.toml")).unwrap();
         folder
     });
@@ -222,12 +228,12 @@ impl Reader {
             "watch" if args.contains(&"--record") => args.extend(["--connect", &endpoint, "--seconds", "10"]),
             "watch" => args.extend(["--connect", &endpoint, "--count", "2"]),
             "serve" => args.extend(["--connect", &endpoint, "--listen", "127.0.0.1:0"]),
-            "play" => args.extend(["--listen", &own_endpoint]),
+            "play" if !args.contains(&"--orbit") => args.extend(["--listen", &own_endpoint]),
             "eval" => args.extend(["--gaussians", "3000", "--nodes", "100"]),
             _ => {}
         }
         eprintln!("{place}: flyrig {}", args.join(" "));
-        if matches!(args[0], "run" | "serve" | "capture" | "play") {
+        if matches!(args[0], "run" | "serve" | "capture" | "play") && !args.contains(&"--orbit") {
             return self.start(place, &args);
         }
         let finished = run(PROGRAM, &args, self.path()).unwrap();

@@ -92,6 +92,7 @@ fn calibrations_of_other_names_and_sizes_are_fitted_and_doubts_are_named() {
         camera.id = CameraId::from(format!("cam{}", camera.id));
     }
     let foreign: PathBuf = out.join("stranger/calib");
+    fs::create_dir_all(&foreign).unwrap();
     Format::Anipose.write(&foreign, &large).unwrap();
     copy_images(&data, &out.join("stranger/images"), |name| format!("view_{name}"));
     let imported = command(&out, "import stranger --out take --trust-calibration");
@@ -126,8 +127,8 @@ fn calibrations_of_other_names_and_sizes_are_fitted_and_doubts_are_named() {
     for (camera, name) in other.cameras.iter_mut().zip(["a", "b", "c", "d", "e", "f", "g"]) {
         camera.id = CameraId::from(name);
     }
-    Format::Flyrig.write(&out.join("stranger"), &other).unwrap();
     copy_images(&data, &out.join("stranger/images"), |name| format!("#{name}"));
+    Format::Flyrig.write(&out.join("stranger"), &other).unwrap();
     let unsure = command(&out, "import stranger --out new");
     assert!(unsure.stderr.contains("--name #00=a --name #01=b"), "{}", unsure.stderr);
 }

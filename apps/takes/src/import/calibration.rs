@@ -33,12 +33,16 @@ pub(super) fn find_calibration(options: &ImportOptions, found: &FoundFootage) ->
     if let Some(path) = &options.calibration {
         return read(path, options.scale, found);
     }
-    let places = places(options, found)?;
     let (mut good, mut bad) = (Vec::new(), Vec::new());
-    for place in places.iter().filter(|place| Format::detect(place).is_some()) {
-        match read(place, options.scale, found) {
-            Ok(calibration) => good.push((place, calibration)),
-            Err(error) => bad.push(error),
+    for places in [within(options, found)?, beside(options)] {
+        for place in places.iter().filter(|place| Format::detect(place).is_some()) {
+            match read(place, options.scale, found) {
+                Ok(calibration) => good.push((place.clone(), calibration)),
+                Err(error) => bad.push(error),
+            }
+        }
+        if !good.is_empty() || !bad.is_empty() {
+            break;
         }
     }
     let others: Vec<String> = good.iter().skip(1).map(|(place, _)| place.display().to_string()).collect();
@@ -59,29 +63,24 @@ pub(super) fn find_calibration(options: &ImportOptions, found: &FoundFootage) ->
     }
 }
 
-/// Returns the folders in which a calibration is looked for, nearest first.
-fn places(options: &ImportOptions, found: &FoundFootage) -> Result<Vec<PathBuf>> {
-    let mut places = vec![found.root.clone()];
+/// Returns the folders within the footage's in which a calibration is looked for, nearest first.
+fn within(options: &ImportOptions, found: &FoundFootage) -> Result<Vec<PathBuf>> {
+    let mut places = Vec::new();
+    for folder in [Some(&found.root), options.inputs.first().filter(|path| path.is_dir())].into_iter().flatten() {
+        for place in [vec![folder.clone()], subfolders(folder)?].concat() {
+            if !places.contains(&place) {
+                places.push(place);
+            }
+        }
+    }
+    Ok(places)
+}
+
+/// Returns the folder around the named one, and those in it: a folder of videos has its calibration beside it.
+fn beside(options: &ImportOptions) -> Vec<PathBuf> {
     let named = options.inputs.first().filter(|path| path.is_dir());
     let above = named.and_then(|folder| std::path::absolute(folder).ok()?.parent().map(Path::to_owned));
-    for folder in [Some(found.root.clone()), named.cloned()].into_iter().flatten() {
-        places.push(folder.clone());
-        places.extend(subfolders(&folder)?);
-    }
-    // A folder named "videos" has its calibration beside it.
-    if let Some(above) = above {
-        places.push(above.clone());
-        places.extend(subfolders(&above).unwrap_or_default());
-    }
-    let mut seen = Vec::new();
-    places.retain(|place| {
-        let known = std::path::absolute(place).unwrap_or_else(|_| place.clone());
-        !seen.contains(&known) && {
-            seen.push(known);
-            true
-        }
-    });
-    Ok(places)
+    above.map_or_else(Vec::new, |above| [vec![above.clone()], subfolders(&above).unwrap_or_default()].concat())
 }
 
 fn read(path: &Path, scale: f64, found: &FoundFootage) -> Result<FoundCalibration> {
@@ -92,8 +91,9 @@ fn read(path: &Path, scale: f64, found: &FoundFootage) -> Result<FoundCalibratio
     })?;
     let names = found.names();
     let size = |id: &CameraId| {
-        let slot = same_camera(id.as_str(), &names)?;
-        found.cameras[slot].size().ok()
+        // Cameras that the footage does not have are left out later; any size reads them.
+        let slot = same_camera(id.as_str(), &names).unwrap_or(0);
+        found.cameras.get(slot)?.size().ok()
     };
     let imported = format.read(path, &size, scale)?;
     let rig = imported.rig(path)?.with_context(|| {
