@@ -28,7 +28,8 @@ pub fn eval(args: &EvalArgs, gpu: &GpuContext) -> Result<()> {
     let plan = EvalPlan::new(&args.take.inputs, &args.holdout.holdout);
     eprintln!("eval: {}", plan.method);
     std::fs::create_dir_all(&args.out).with_context(|| format!("cannot create {}", args.out.display()))?;
-    let mut runs = open(args, &plan, gpu)?;
+    // A folder that stays empty is removed again.
+    let mut runs = open(args, &plan, gpu).inspect_err(|_| drop(std::fs::remove_dir(&args.out)))?;
     let first = runs.first_mut().context("no camera")?;
     let mut shown = TakeShow::new(&args.name(), first.replay.session.rig(), args.orbit.as_deref())?;
     let mut evaluation = Evaluation::new(&args.out, &runs);

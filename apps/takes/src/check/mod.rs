@@ -41,14 +41,16 @@ use flyrig_capture::FolderOptions;
 /// cannot be written, a single camera, and a person who tells nothing leave the calibration as it is, with a line that says so.
 ///
 /// # Errors
-/// The calibration cannot be read.
+/// The result cannot be written.
 pub fn check_take(root: &Path, fps: f64, gpu: &dyn Fn() -> Result<GpuContext>) -> Result<()> {
     let footage = Footage::from_dataset(root);
     let Some(root) = footage.folder() else { return Ok(()) };
-    let OpenFootage { sources, .. } = footage.open(None, &FolderOptions { fps, ..FolderOptions::default() })?;
+    // What cannot be opened is named by the command, which opens it again.
+    let opened = footage.open(None, &FolderOptions { fps, ..FolderOptions::default() });
+    let Ok(OpenFootage { sources, .. }) = opened else { return Ok(()) };
     let cameras: Vec<_> = sources.iter().map(|source| source.camera().clone()).collect();
     drop(sources);
-    let all = footage.load_rig(&cameras)?;
+    let Ok(all) = footage.load_rig(&cameras) else { return Ok(()) };
     let names: Vec<String> = all.cameras.iter().map(|camera| camera.id.to_string()).collect();
     let with_images: Vec<String> = names.into_iter().filter(|name| cameras.contains(&name.as_str().into())).collect();
     let rig = dataset::select_cameras(&all, &with_images, "the calibration")?;
