@@ -26,8 +26,8 @@ const PROGRAM: &str = env!("CARGO_BIN_EXE_flyrig-under-test");
 const SEEN_SIM: &str = "width = 160\nheight = 160\ntexture_px = 256\n";
 
 /// Lengths and cameras in the guide, and those of the test.
-const SHORTER: [(&str, &str); 12] = [
-    ("--seconds 60", "--seconds 2"),
+const SHORTER: [(&str, &str); 13] = [
+    ("--seconds 60", "--seconds 6"),
     ("--seconds 20", "--seconds 2"),
     ("--seconds 10", "--seconds 2"),
     ("--seconds 30", "--seconds 20"),
@@ -41,6 +41,7 @@ const SHORTER: [(&str, &str); 12] = [
     // Each camera in turn takes minutes, and the simulated cameras stand far apart.
     ("eval take.mcap", "eval take.mcap --inputs 00,02 --holdout 01"),
     ("--size 1080x1080", "--size 108x108"),
+    ("--frames 0..90", "--frames 0..2"),
 ];
 
 fn root() -> PathBuf {
