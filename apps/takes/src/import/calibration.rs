@@ -76,11 +76,14 @@ fn within(options: &ImportOptions, found: &FoundFootage) -> Result<Vec<PathBuf>>
     Ok(places)
 }
 
-/// Returns the folder around the named one, and those in it: a folder of videos has its calibration beside it.
+/// Returns the folder around the named one, and those in it: a folder of videos has its calibration beside it. Other takes are left out.
 fn beside(options: &ImportOptions) -> Vec<PathBuf> {
     let named = options.inputs.first().filter(|path| path.is_dir());
     let above = named.and_then(|folder| std::path::absolute(folder).ok()?.parent().map(Path::to_owned));
-    above.map_or_else(Vec::new, |above| [vec![above.clone()], subfolders(&above).unwrap_or_default()].concat())
+    let is_take = |folder: &PathBuf| ["images", "videos"].iter().any(|name| folder.join(name).is_dir());
+    let siblings =
+        |above: &Path| subfolders(above).unwrap_or_default().into_iter().filter(|folder| !is_take(folder)).collect();
+    above.map_or_else(Vec::new, |above| [vec![above.clone()], siblings(&above)].concat())
 }
 
 fn read(path: &Path, scale: f64, found: &FoundFootage) -> Result<FoundCalibration> {
