@@ -116,18 +116,20 @@ fn a_demo_goes_through_every_fault_of_a_rig() {
     assert!(refused.stderr.contains("bad.toml") && refused.stderr.contains("fault.mm is 3"), "{}", refused.stderr);
 }
 
+/// Returns a command of the program that finds no desktop.
+fn without_desktop(command: &str, folder: &std::path::Path) -> std::process::Command {
+    let mut program = std::process::Command::new(PROGRAM);
+    program.arg(command).current_dir(folder);
+    for variable in ["DISPLAY", "WAYLAND_DISPLAY", "WAYLAND_SOCKET", "XDG_RUNTIME_DIR"] {
+        program.env_remove(variable);
+    }
+    program
+}
+
 #[test]
 fn a_window_without_a_desktop_is_refused_in_six_words() {
     let folder = tempfile::tempdir().unwrap();
-    let output = std::process::Command::new(PROGRAM)
-        .args(["view"])
-        .current_dir(folder.path())
-        .env_remove("DISPLAY")
-        .env_remove("WAYLAND_DISPLAY")
-        .env_remove("WAYLAND_SOCKET")
-        .env_remove("XDG_RUNTIME_DIR")
-        .output()
-        .unwrap();
+    let output = without_desktop("view", folder.path()).output().unwrap();
     assert_eq!(output.status.code(), Some(1));
     assert_eq!(String::from_utf8_lossy(&output.stderr), "error: no desktop here: use flyrig watch\n");
     let refused = run(PROGRAM, &["view", "--wait", "5"], folder.path()).unwrap();
@@ -137,15 +139,7 @@ fn a_window_without_a_desktop_is_refused_in_six_words() {
 #[test]
 fn a_desktop_that_does_not_answer_is_named_without_words_of_libraries() {
     let folder = tempfile::tempdir().unwrap();
-    let output = std::process::Command::new(PROGRAM)
-        .args(["view"])
-        .current_dir(folder.path())
-        .env("DISPLAY", ":987")
-        .env_remove("WAYLAND_DISPLAY")
-        .env_remove("WAYLAND_SOCKET")
-        .env_remove("XDG_RUNTIME_DIR")
-        .output()
-        .unwrap();
+    let output = without_desktop("view", folder.path()).env("DISPLAY", ":987").output().unwrap();
     assert_eq!(output.status.code(), Some(1));
     let text = String::from_utf8_lossy(&output.stderr);
     let lines: Vec<&str> = text.lines().collect();
@@ -159,11 +153,6 @@ fn a_desktop_that_does_not_answer_is_named_without_words_of_libraries() {
 fn libraries_write_nothing_to_the_terminal() {
     let folder = tempfile::tempdir().unwrap();
     // Opens the graphics adapter.
-    let output = std::process::Command::new(PROGRAM)
-        .args(["doctor"])
-        .current_dir(folder.path())
-        .env_remove("XDG_RUNTIME_DIR")
-        .output()
-        .unwrap();
+    let output = without_desktop("doctor", folder.path()).output().unwrap();
     assert_eq!(String::from_utf8_lossy(&output.stderr), "");
 }

@@ -1,4 +1,4 @@
-//! Camera of `flyrig avatar render`: sees the whole clip, or stands where it is told.
+//! Camera of `flyrig avatar render`: placed so that the whole clip is in view, or at `--eye`.
 
 use anyhow::{Result, ensure};
 use clap::Args;

@@ -48,12 +48,7 @@ impl ColorFinding {
 }
 
 /// Matches the cameras' colours on the person of the take's beginning.
-pub(super) fn match_take(
-    rig: &Rig,
-    plates: &[Option<Image>],
-    open: &dyn Fn() -> Result<Take>,
-    gpu: GpuContext,
-) -> Result<ColorFinding> {
+pub(super) fn match_take(rig: &Rig, plates: &[Option<Image>], take: Take, gpu: GpuContext) -> Result<ColorFinding> {
     let raw = Rig {
         cameras: rig
             .cameras
@@ -63,14 +58,15 @@ pub(super) fn match_take(
             .collect(),
         world_up: rig.world_up,
     };
-    let sets = read_sets(&raw, open()?)?;
+    let given_masks = take.given_masks;
+    let sets = read_sets(&raw, take)?;
     let step = sets.len().div_ceil(SHAPE_SETS).max(1);
     let in_shape = |set: &&FrameSet| {
         let first = sets.first().map_or(0, |set| set.master_nanos);
         set.master_nanos.saturating_sub(first) as f64 * 1e-9 <= 2.0 * SHAPE_SECS
     };
     let first: Vec<FrameSet> = sets.iter().filter(in_shape).step_by(step).cloned().collect();
-    let mut sampler = ColorSampler::new(&raw, plates, open()?.given_masks, 1, &first, gpu)?;
+    let mut sampler = ColorSampler::new(&raw, plates, given_masks, 1, &first, gpu)?;
     let bar = flyrig_report::progress_bar(sets.len() as u64, "colours");
     for set in &sets {
         sampler.add(set, true)?;

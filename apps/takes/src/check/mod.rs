@@ -107,7 +107,9 @@ pub fn check(input: CheckInput<'_>, gpu: &dyn Fn() -> Result<GpuContext>) -> Res
         })
     };
     let finding = measure(rigs, copies(&plates)?, open(first)?, &stretches)?;
-    let colors = match_take(&finding.rig, &plates, &|| open(&finding.rig), gpu()?).unwrap_or_else(|error| {
+    let gpu = gpu()?;
+    let colors = open(&finding.rig).and_then(|take| match_take(&finding.rig, &plates, take, gpu));
+    let colors = colors.unwrap_or_else(|error| {
         tracing::debug!(%error, "the colours could not be matched");
         ColorFinding::none(&finding.rig)
     });

@@ -42,8 +42,6 @@ pub fn import(options: &ImportOptions, gpu: &dyn Fn() -> Result<GpuContext>) -> 
     let rigs = fit_sizes(&found, &calibration, &pairs.pairs)?;
     let writer = TakeWriter::create(&options.out)?;
     writer.footage(&found, &pairs.pairs.iter().map(|(camera, _)| *camera).collect::<Vec<_>>())?;
-    let rig = rigs.first().context("no calibration fits")?.clone();
-    Format::Flyrig.write(&options.out, &rig)?;
     let rigs = find_up(&options.out, rigs, calibration.up_is_stated, options.fps);
     let chosen = correct(options, &rigs, gpu)?;
     writer.finish();
