@@ -7,10 +7,10 @@ use std::{
 
 use anyhow::Result;
 use clap::{Args, Subcommand};
+use flyrig_capture::FolderOptions;
 use flyrig_gpu::GpuContext;
 use flyrig_report::{progress_bar, stop};
 use flyrig_sim::{CalibrationError, ExportOptions, SimConfig, Simulator, export};
-
 use flyrig_takes::mark_checked;
 
 use crate::{config::Config, simulator_file};
@@ -80,16 +80,10 @@ pub fn sim_export(args: &SimExportArgs, config: &SimConfig, gpu: &GpuContext) ->
     if exported.lost > 0 {
         println!("{} frames were lost by the fault script; truth/frames.csv says which", exported.lost);
     }
-    let (inputs, holdout): (Vec<_>, Vec<_>) = names.iter().enumerate().partition(|(i, _)| i % 2 == 0);
-    let list = |cameras: Vec<(usize, &&str)>| cameras.iter().map(|(_, name)| **name).collect::<Vec<_>>().join(",");
-    if !holdout.is_empty() {
-        println!(
-            "score it with: flyrig eval {} --inputs {} --holdout {} --fps {} --out out/eval",
-            args.out.display(),
-            list(inputs),
-            list(holdout),
-            config.fps
-        );
+    if names.len() > 1 {
+        let rate =
+            if config.fps == FolderOptions::default().fps { String::new() } else { format!(" --fps {}", config.fps) };
+        println!("score it with: flyrig eval {}{rate}", args.out.display());
     }
     Ok(())
 }

@@ -19,8 +19,29 @@ use image::RgbImage;
 
 /// Interval after which an image follows whose time does not, nanoseconds.
 const NOMINAL_NANOS: i64 = 40_000_000;
-/// Quality of the codecs, 1 (best) to 31, in FFmpeg's unit.
-const QUALITY: u32 = 3 * 118;
+
+/// Codec of a file, with its pixel format and the options that set its quality.
+type Codec = (&'static str, &'static str, &'static [(&'static str, &'static str)]);
+
+/// H.264, which every browser plays. Images refer to earlier ones only, so that they are stored in the order of their times. The colours are
+/// described, because players guess the matrix by the size otherwise.
+const H264: Codec = (
+    "libx264",
+    "yuv420p",
+    &[
+        ("preset", "veryfast"),
+        ("crf", "18"),
+        ("bf", "0"),
+        ("flags", "+global_header"),
+        ("color_range", "tv"),
+        ("colorspace", "smpte170m"),
+        ("color_primaries", "bt709"),
+        ("color_trc", "iec61966-2-1"),
+    ],
+);
+/// MPEG-4 Part 2, where FFmpeg was built without H.264. Quality 3 of 1 (best) to 31, in units of 1/118.
+const MPEG4: Codec = ("mpeg4", "yuv420p", &[("flags", "+qscale+global_header"), ("global_quality", "354")]);
+const MOTION_JPEG: Codec = ("mjpeg", "yuvj420p", &[("flags", "+qscale+global_header"), ("global_quality", "354")]);
 
 /// Video file of images of one size.
 pub struct VideoFile {
@@ -63,48 +84,59 @@ impl Ticks {
 }
 
 impl VideoFile {
-    /// Creates a file: MPEG-4, with times of 0.02 ms, or Motion JPEG in AVI, with times of 5 ms, by its ending.
+    /// Creates a file, by its ending: H.264 in MP4 with times of 0.02 ms, or Motion JPEG in AVI with times of 5 ms. H.264 has even sizes only;
+    /// images of others are stretched by a pixel.
     ///
     /// # Errors
     /// The file cannot be created, with the cause.
-    pub fn create(path: &Path, (width, height): (u32, u32)) -> Result<Self> {
-        // AVI repeats images in place of times; more than 65535 ticks per second MPEG-4 does not count.
-        let (container, codec, pixels, per_second) = if path.extension().is_some_and(|e| e.eq_ignore_ascii_case("avi"))
-        {
-            ("avi", "mjpeg", "yuvj420p", 200)
-        } else {
-            ("mp4", "mpeg4", "yuv420p", 50_000)
-        };
+    pub fn create(path: &Path, size: (u32, u32)) -> Result<Self> {
         let refused = || format!("cannot write a video to {}; does its folder exist?", path.display());
         let file = File::create(path).with_context(refused)?;
-        let open = || -> Result<_, Error> {
-            let format = pixel_format(pixels)?;
-            let time_base = TimeBase::new(1, per_second);
-            let (across, down) = (width as usize, height as usize);
-            let encoder = VideoEncoder::builder(codec)?
-                .pixel_format(format)
-                .width(across)
-                .height(down)
-                .time_base(time_base)
-                .set_option("flags", "+qscale+global_header")
-                .set_option("global_quality", QUALITY)
-                .build()?;
-            let scaler = VideoFrameScaler::builder()
-                .source_pixel_format(pixel_format("rgb24")?)
-                .source_width(across)
-                .source_height(down)
-                .target_pixel_format(format)
-                .target_width(across)
-                .target_height(down)
-                .build()?;
-            let mut muxer = Muxer::builder();
-            muxer.add_stream(&CodecParameters::from(encoder.codec_parameters()))?;
-            muxer.streams_mut()[0].set_time_base(time_base);
-            let container = OutputFormat::find_by_name(container).ok_or_else(|| Error::new("unknown container"))?;
-            let muxer = muxer.build(IO::from_seekable_write_stream(file), container)?;
-            Ok(Self { encoder, muxer, scaler, size: (width, height), ticks: Ticks { per_second, last: None } })
-        };
-        open().with_context(refused)
+        if path.extension().is_some_and(|ending| ending.eq_ignore_ascii_case("avi")) {
+            // AVI repeats images in place of times.
+            return Self::open(file, "avi", MOTION_JPEG, 200, size).with_context(refused);
+        }
+        // More than 65535 ticks per second MPEG-4 does not count.
+        let open = |codec| Self::open(file.try_clone()?, "mp4", codec, 50_000, size);
+        open(H264).or_else(|_| open(MPEG4)).with_context(refused)
+    }
+
+    fn open(
+        file: File,
+        container: &str,
+        (codec, pixels, options): Codec,
+        per_second: i32,
+        size: (u32, u32),
+    ) -> Result<Self> {
+        // FFmpeg prints what it also returns.
+        ac_ffmpeg::set_log_callback(|_, _| {});
+        let format = pixel_format(pixels)?;
+        let time_base = TimeBase::new(1, per_second);
+        let (across, down) = (size.0 as usize, size.1 as usize);
+        let even = |side: usize| if codec == H264.0 { side.next_multiple_of(2) } else { side };
+        let mut encoder = VideoEncoder::builder(codec)?
+            .pixel_format(format)
+            .width(even(across))
+            .height(even(down))
+            .time_base(time_base);
+        for (name, value) in options {
+            encoder = encoder.set_option(name, value);
+        }
+        let encoder = encoder.build()?;
+        let scaler = VideoFrameScaler::builder()
+            .source_pixel_format(pixel_format("rgb24")?)
+            .source_width(across)
+            .source_height(down)
+            .target_pixel_format(format)
+            .target_width(even(across))
+            .target_height(even(down))
+            .build()?;
+        let mut muxer = Muxer::builder();
+        muxer.add_stream(&CodecParameters::from(encoder.codec_parameters()))?;
+        muxer.streams_mut()[0].set_time_base(time_base);
+        let container = OutputFormat::find_by_name(container).ok_or_else(|| Error::new("unknown container"))?;
+        let muxer = muxer.build(IO::from_seekable_write_stream(file), container)?;
+        Ok(Self { encoder, muxer, scaler, size, ticks: Ticks { per_second, last: None } })
     }
 
     /// Returns width and height, pixels.

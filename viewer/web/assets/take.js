@@ -195,6 +195,8 @@ function tick(now) {
   drawing.setRotations(rotations ? list(rotations) : null, count);
   drawing.setColors(list(wasm.colors()), count);
   if (rotations) drawing.setScales(list(wasm.scales()), count);
+  const shadow = wasm.shadow(), side = wasm.shadow_side();
+  if (shadow) drawing.setFloor(new Float32Array(wasm.memory.buffer, wasm.floor(), 12), new Uint8Array(wasm.memory.buffer, shadow, side * side), side);
   drawing.draw(new Float32Array(wasm.memory.buffer, wasm.camera(), 19), BACKGROUND, new Uint32Array(wasm.memory.buffer, order, wasm.order_length()));
   [uploaded, dirty] = [true, false];
   document.documentElement.dataset.frame = wasm.frame();

@@ -1,7 +1,8 @@
 //! Files of the page, embedded in the program.
 
-use std::sync::LazyLock;
+use std::{io::Write as _, sync::LazyLock};
 
+use flate2::{Compression, write::GzEncoder};
 use flyrig_renderer::BrowserKernels;
 use hyper::body::Bytes;
 use serde_json::{Map, Value, json};
@@ -11,20 +12,32 @@ pub(crate) struct Asset {
     pub path: &'static str,
     pub kind: &'static str,
     pub bytes: Bytes,
+    /// The bytes, compressed by gzip.
+    pub packed: Bytes,
+}
+
+impl Asset {
+    fn new(path: &'static str, kind: &'static str, bytes: impl Into<Bytes>) -> Self {
+        let bytes = bytes.into();
+        let mut packed = GzEncoder::new(Vec::new(), Compression::best());
+        // Writing to memory cannot fail.
+        let packed = packed.write_all(&bytes).and_then(|()| packed.finish()).unwrap_or_default();
+        Self { path, kind, bytes, packed: packed.into() }
+    }
 }
 
 const SCRIPT: &str = "text/javascript; charset=utf-8";
 
 /// All files of the page.
 static ASSETS: LazyLock<[Asset; 6]> = LazyLock::new(|| {
-    let file = |path, kind, bytes| Asset { path, kind, bytes: Bytes::from_static(bytes) };
+    let file = |path, kind, bytes: &'static [u8]| Asset::new(path, kind, bytes);
     [
-        file("/", "text/html; charset=utf-8", include_bytes!("../assets/index.html").as_slice()),
+        file("/", "text/html; charset=utf-8", include_bytes!("../assets/index.html")),
         file("/page.js", SCRIPT, include_bytes!("../assets/page.js")),
         file("/draw_webgl2.js", SCRIPT, include_bytes!("../assets/draw_webgl2.js")),
         file("/draw_webgpu.js", SCRIPT, include_bytes!("../assets/draw_webgpu.js")),
         file("/page.wasm", "application/wasm", include_bytes!("../assets/page.wasm")),
-        Asset { path: "/kernels.json", kind: "application/json", bytes: kernels().into() },
+        Asset::new("/kernels.json", "application/json", kernels()),
     ]
 });
 

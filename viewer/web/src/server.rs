@@ -15,9 +15,12 @@ use flyrig_transport::TransportConfig;
 use flyrig_types::{SupervisedThread, ThreadHealth, lock};
 use http_body_util::Full;
 use hyper::{
-    Method, Request, Response, StatusCode,
+    HeaderMap, Method, Request, Response, StatusCode,
     body::{Bytes, Incoming},
-    header::{CONNECTION, CONTENT_TYPE, HeaderName, HeaderValue, SEC_WEBSOCKET_ACCEPT, SEC_WEBSOCKET_KEY, UPGRADE},
+    header::{
+        ACCEPT_ENCODING, CONNECTION, CONTENT_ENCODING, CONTENT_TYPE, HeaderName, HeaderValue, SEC_WEBSOCKET_ACCEPT,
+        SEC_WEBSOCKET_KEY, UPGRADE,
+    },
     server::conn::http1,
     service::service_fn,
     upgrade::{OnUpgrade, Upgraded},
@@ -309,9 +312,31 @@ fn respond(
         return response;
     }
     match asset(request.uri().path()) {
+        Some(asset) if takes_gzip(request.headers()) => {
+            let mut response = page(StatusCode::OK, asset.kind, asset.packed.clone());
+            response.headers_mut().insert(CONTENT_ENCODING, HeaderValue::from_static("gzip"));
+            response
+        }
         Some(asset) => page(StatusCode::OK, asset.kind, asset.bytes.clone()),
         None => text(StatusCode::NOT_FOUND, "there is nothing here; the page is at /\n"),
     }
+}
+
+/// Returns whether the client takes answers that are compressed by gzip.
+fn takes_gzip(headers: &HeaderMap) -> bool {
+    let named = |coding: &str| {
+        let (name, weight) = coding.split_once(';').unwrap_or((coding, ""));
+        let refused = weight
+            .trim()
+            .strip_prefix("q=")
+            .is_some_and(|weight| weight.trim().parse::<f64>().is_ok_and(|weight| weight <= 0.0));
+        name.trim().eq_ignore_ascii_case("gzip") && !refused
+    };
+    headers
+        .get_all(ACCEPT_ENCODING)
+        .iter()
+        .filter_map(|value| value.to_str().ok())
+        .any(|value| value.split(',').any(named))
 }
 
 fn page(status: StatusCode, kind: &'static str, body: Bytes) -> Response<Full<Bytes>> {
@@ -330,7 +355,31 @@ fn page(status: StatusCode, kind: &'static str, body: Bytes) -> Response<Full<By
 #[cfg(test)]
 #[allow(clippy::unwrap_used)]
 mod tests {
+    use std::io::Read as _;
+
     use super::*;
+
+    #[test]
+    fn gzip_is_used_where_the_client_takes_it() {
+        let takes = |value: &'static str| {
+            let mut headers = HeaderMap::new();
+            headers.insert(ACCEPT_ENCODING, HeaderValue::from_static(value));
+            takes_gzip(&headers)
+        };
+        for value in ["gzip", "gzip, deflate, br, zstd", "br;q=1.0, GZIP;q=0.5", "deflate,gzip;q=x"] {
+            assert!(takes(value), "{value}");
+        }
+        for value in ["", "identity", "br", "gzip;q=0", "gzip; q=0.000", "gzip2"] {
+            assert!(!takes(value), "{value}");
+        }
+        assert!(!takes_gzip(&HeaderMap::new()));
+        for path in ["/", "/page.js", "/page.wasm", "/kernels.json"] {
+            let asset = asset(path).unwrap();
+            let mut bytes = Vec::new();
+            flate2::read::GzDecoder::new(&*asset.packed).read_to_end(&mut bytes).unwrap();
+            assert!(bytes == asset.bytes && asset.packed.len() < asset.bytes.len() / 2, "{path}");
+        }
+    }
 
     #[test]
     fn a_slow_line_has_time_for_the_largest_file() {

@@ -401,7 +401,7 @@ fn an_answer_that_is_not_read_ends() {
     let server = server("tcp/127.0.0.1:1", "127.0.0.1:0", false);
     let mut deaf = TcpStream::connect(server.address()).unwrap();
     deaf.write_all(b"GET /page.wasm HTTP/1.1\r\nHost: localhost\r\n\r\n").unwrap();
-    std::thread::sleep(Duration::from_secs(11));
+    std::thread::sleep(Duration::from_secs(13));
     let mut answer = Vec::new();
     let _ = deaf.read_to_end(&mut answer);
     assert!(answer.starts_with(b"HTTP/1.1 200") && answer.len() < 200_000, "{} bytes", answer.len());

@@ -35,12 +35,24 @@ pub fn lens(args: &CalibrateLensArgs, gpu: &dyn Fn() -> Result<GpuContext>) -> R
     let board = load_board(&args.board.board, &args.take)?;
     refuse_existing(&args.target.out, &["calibration.toml"], args.target.force)?;
     let seen = SeenBoards::find(&args.take, &board, gpu)?;
-    let lenses = seen.ids.iter().zip(solve(&board, &seen)).map(|(id, lens)| Ok((id.clone(), lens?)));
-    let lenses = lenses.collect::<Result<Vec<(CameraId, Intrinsics)>>>()?;
+    let (mut lenses, mut missing) = (Vec::<(CameraId, Intrinsics)>::new(), Vec::new());
+    for (id, lens) in seen.ids.iter().zip(solve(&board, &seen)) {
+        match lens {
+            Ok(lens) => lenses.push((id.clone(), lens)),
+            Err(error) => missing.push(format!("{error:#}")),
+        }
+    }
+    ensure!(!lenses.is_empty(), "{}", missing.join("; "));
     std::fs::create_dir_all(&args.target.out)
         .with_context(|| format!("cannot create {}", args.target.out.display()))?;
     save_lenses(&args.target.out, &lenses)?;
     println!("{}: calibration.toml with lenses alone", args.target.out.display());
+    ensure!(
+        missing.is_empty(),
+        "{}; the lenses of the other {} cameras are written; show the board to these cameras too and run this again with --force",
+        missing.join("; "),
+        lenses.len()
+    );
     println!("next: flyrig calibrate rig TAKE --lenses {}", args.target.out.display());
     Ok(())
 }
