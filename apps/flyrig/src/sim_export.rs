@@ -81,8 +81,11 @@ pub fn sim_export(args: &SimExportArgs, config: &SimConfig, gpu: &GpuContext) ->
         println!("{} frames were lost by the fault script; truth/frames.csv says which", exported.lost);
     }
     if names.len() > 1 {
-        let rate =
-            if config.fps == FolderOptions::default().fps { String::new() } else { format!(" --fps {}", config.fps) };
+        let rate = if (config.fps - FolderOptions::default().fps).abs() < 1e-9 {
+            String::new()
+        } else {
+            format!(" --fps {}", config.fps)
+        };
         println!("score it with: flyrig eval {}{rate}", args.out.display());
     }
     Ok(())
