@@ -26,6 +26,17 @@ struct Visitor {
     pending: usize,
 }
 
+/// Whether a handshake may begin.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(crate) enum Begin {
+    /// It has begun; [`Limits::end`] must follow.
+    Begun,
+    /// Not before a handshake of another address has ended.
+    Full,
+    /// The address must wait.
+    TooMany,
+}
+
 /// Counts of connections by address.
 #[derive(Debug, Default)]
 pub(crate) struct Limits {
@@ -45,8 +56,8 @@ pub(crate) fn network(address: IpAddr) -> IpAddr {
 }
 
 impl Limits {
-    /// Begins a handshake of an address; returns false when the address must wait. Otherwise [`Self::end`] must follow.
-    pub fn begin(&mut self, address: IpAddr, now: Instant) -> bool {
+    /// Begins a handshake of an address.
+    pub fn begin(&mut self, address: IpAddr, now: Instant) -> Begin {
         if self.visitors.len() >= ADDRESSES {
             // After this time a visitor has its whole burst again.
             let full = saturating_secs(BURST / PER_SECOND);
@@ -54,19 +65,22 @@ impl Limits {
         }
         let network = network(address);
         if self.visitors.len() >= ADDRESSES && !self.visitors.contains_key(&network) {
-            return false;
+            return Begin::TooMany;
         }
         let visitor = self.visitors.entry(network).or_insert(Visitor { left: BURST, at: now, pending: 0 });
         let since = now.duration_since(visitor.at).as_secs_f64();
         visitor.left = (visitor.left + since * PER_SECOND).min(BURST);
         visitor.at = now;
-        if visitor.left < 1.0 || visitor.pending >= PENDING_OF_ONE || self.pending >= PENDING {
-            return false;
+        if visitor.left < 1.0 || visitor.pending >= PENDING_OF_ONE {
+            return Begin::TooMany;
+        }
+        if self.pending >= PENDING {
+            return Begin::Full;
         }
         visitor.left -= 1.0;
         visitor.pending += 1;
         self.pending += 1;
-        true
+        Begin::Begun
     }
 
     /// Ends a handshake.
@@ -88,19 +102,20 @@ mod tests {
     fn one_address_does_not_use_up_the_room_of_others() {
         let (mut limits, now) = (Limits::default(), Instant::now());
         let (noisy, calm) = (IpAddr::from([10, 0, 0, 1]), IpAddr::from([10, 0, 0, 2]));
-        assert_eq!((0..1000).filter(|_| limits.begin(noisy, now)).count(), PENDING_OF_ONE);
-        assert!(limits.begin(calm, now));
+        assert_eq!((0..1000).filter(|_| limits.begin(noisy, now) == Begin::Begun).count(), PENDING_OF_ONE);
+        assert_eq!(limits.begin(calm, now), Begin::Begun);
         // Handshakes that end make room, until the burst is used up.
         (0..PENDING_OF_ONE).for_each(|_| limits.end(noisy));
         let mut begun = PENDING_OF_ONE;
-        while limits.begin(noisy, now) {
+        while limits.begin(noisy, now) == Begin::Begun {
             limits.end(noisy);
             begun += 1;
         }
         assert_eq!(begun, BURST as usize);
         // Then the rate per second applies.
         let later = |tenths: u64| now + Duration::from_millis(100 * tenths);
-        let slow = (1..=100).filter(|tenth| (0..50).any(|_| limits.begin(noisy, later(*tenth)))).count();
+        let slow =
+            (1..=100).filter(|tenth| (0..50).any(|_| limits.begin(noisy, later(*tenth)) == Begin::Begun)).count();
         assert!(slow >= 14, "{slow}");
     }
 
@@ -109,13 +124,14 @@ mod tests {
         let (mut limits, now) = (Limits::default(), Instant::now());
         let mut begun = 0;
         for n in 0..100_000u32 {
-            begun += usize::from(limits.begin(IpAddr::from(n.to_be_bytes()), now));
+            begun += usize::from(limits.begin(IpAddr::from(n.to_be_bytes()), now) == Begin::Begun);
         }
         assert_eq!(begun, PENDING);
+        assert_eq!(limits.begin(IpAddr::from(0u32.to_be_bytes()), now), Begin::Full, "an address that has few");
         assert!(limits.visitors.len() <= ADDRESSES);
         let later = now + Duration::from_secs(60);
         (0..PENDING as u32).for_each(|n| limits.end(IpAddr::from(n.to_be_bytes())));
-        assert!(limits.begin(IpAddr::from([1, 2, 3, 4]), later));
+        assert_eq!(limits.begin(IpAddr::from([1, 2, 3, 4]), later), Begin::Begun);
         assert!(limits.visitors.len() < 10);
     }
 
@@ -123,8 +139,8 @@ mod tests {
     fn an_ipv6_network_is_one_visitor() {
         let (mut limits, now) = (Limits::default(), Instant::now());
         let of = |host: u16| IpAddr::from([0x2001, 0xdb8, 0, 1, 0, 0, 0, host]);
-        assert_eq!((0..1000).filter(|host| limits.begin(of(*host), now)).count(), PENDING_OF_ONE);
-        assert!(limits.begin(IpAddr::from([0x2001, 0xdb8, 0, 2, 0, 0, 0, 1]), now));
+        assert_eq!((0..1000).filter(|host| limits.begin(of(*host), now) == Begin::Begun).count(), PENDING_OF_ONE);
+        assert_eq!(limits.begin(IpAddr::from([0x2001, 0xdb8, 0, 2, 0, 0, 0, 1]), now), Begin::Begun);
         assert_eq!(network("::ffff:10.0.0.1".parse().unwrap()), IpAddr::from([10, 0, 0, 1]));
     }
 }

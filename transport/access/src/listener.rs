@@ -3,7 +3,8 @@
 //! One thread accepts connections and serves them as tasks. A connection beyond [`Bounds::connections`], or beyond the file descriptors
 //! that the rest of the process needs ([`crate::open_files`]), takes the place of one that is not established ([`crate::places`]); where
 //! all are, it waits, or is disconnected for lack of a descriptor. Where [`Bounds::per_address`] is set, an address that begins too many
-//! connections, or has too many handshakes under way, is disconnected at once ([`crate::limits`]).
+//! connections, or has too many handshakes under way, is disconnected at once ([`crate::limits`]); where all addresses together have too many, a
+//! new handshake takes the place of one of the address that has the most.
 
 use std::{
     future::{Future, pending},
@@ -24,7 +25,7 @@ use tokio::{
 };
 
 use crate::{
-    limits::Limits,
+    limits::{Begin, Limits},
     open_files,
     places::{Places, make_room},
 };
@@ -233,10 +234,17 @@ async fn accept(listener: &TcpListener, bounds: Bounds, service: &Arc<impl Serve
             }
             continue;
         }
-        let begins = |limits: &Mutex<Limits>| lock(limits).begin(address, Instant::now());
-        if limits.as_deref().is_some_and(|limits| !begins(limits)) {
-            service.refuse(address);
-            continue;
+        if let Some(limits) = &limits {
+            let begin = || lock(limits).begin(address, Instant::now());
+            let mut begun = begin();
+            // Silent handshakes of many addresses keep nobody out either.
+            while begun == Begin::Full && make_room(&places).await {
+                begun = begin();
+            }
+            if begun != Begin::Begun {
+                service.refuse(address);
+                continue;
+            }
         }
         let handshake = limits.clone().map(|limits| (limits, address));
         let free = || Arc::clone(&permits).acquire_owned();
@@ -383,5 +391,24 @@ mod tests {
         // An established connection counts no more.
         assert!(is_answered(&mut open[0]));
         assert!(is_answered(&mut connect(&listener)));
+    }
+
+    #[test]
+    #[cfg(target_os = "linux")]
+    fn silent_handshakes_of_many_addresses_keep_nobody_out() {
+        let from = |listener: &Listener, source: [u8; 4]| -> Client {
+            let socket = Socket::new(Domain::IPV4, Type::STREAM, Some(Protocol::TCP)).unwrap();
+            socket.bind(&SocketAddr::from((source, 0)).into()).unwrap();
+            socket.connect(&listener.address().into()).unwrap();
+            socket.set_read_timeout(Some(Duration::from_secs(20))).unwrap();
+            socket.into()
+        };
+        let (_, listener) = start(1000, true);
+        let mut silent: Vec<Client> =
+            (0..20).flat_map(|host| [host; 16]).map(|host| from(&listener, [127, 1, host, 1])).collect();
+        assert!(is_answered(&mut from(&listener, [127, 0, 0, 2])));
+        silent.iter().for_each(|client| client.set_nonblocking(true).unwrap());
+        let ended = silent.iter_mut().filter_map(|client| has_ended(client).then_some(())).count();
+        assert_eq!(ended, 320 + 1 - 256, "one more is answered, and its handshake over");
     }
 }
