@@ -33,7 +33,7 @@ pub const RESERVE_BYTES: u64 = 1 << 30;
 /// Size and duration at which a chunk ends. A killed process loses the chunk and what waits for it, together less than
 /// half a second.
 const CHUNK_BYTES: u64 = 8 << 20;
-const CHUNK_TIME: Duration = Duration::from_millis(250);
+const CHUNK_TIME: Duration = Duration::from_millis(150);
 /// Interval between syncs to the disk: the most that a power cut loses, besides a chunk.
 const SYNC_TIME: Duration = Duration::from_secs(2);
 /// Interval between looks at the free space of a full disk.
