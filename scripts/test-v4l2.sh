@@ -120,9 +120,11 @@ name = "01"
 nokhwa = "1"
 size = [320, 180]
 fps = 10
+[perception]
+pose = "given"
+masks = "estimated"
 [body]
 template = "/rig/subject.glb"
-masks = "estimated"
 gaussians = 2000
 nodes = 50
 RIG
