@@ -92,6 +92,9 @@ impl Depthwise {
         let shape = pool.data_format.shape(shape)?;
         let sizes = pool.computed_padding(shape.hw_dims());
         let (&[height, width], [rows, columns]) = (shape.hw_dims(), &sizes[..]) else { return Ok(None) };
+        if height == 0 || width == 0 {
+            return Ok(None);
+        }
         let geometry = Geometry {
             input: [height, width],
             output: [rows.convoluted, columns.convoluted],
@@ -114,10 +117,12 @@ impl Depthwise {
             let Some(bound) = model.outlet_fact(other)?.konst.as_ref().filter(|bound| bound.len() == 1) else { break };
             let bound = bound.try_as_plain_ram()?.as_slice::<f32>()?[0];
             let [low, high] = self.range()?;
-            let range = match () {
-                () if op.is::<Max>() => [low.max(bound), high.max(bound)],
-                () if op.is::<Min>() => [low.min(bound), high.min(bound)],
-                () => break,
+            let range = if op.is::<Max>() {
+                [low.max(bound), high.max(bound)]
+            } else if op.is::<Min>() {
+                [low.min(bound), high.min(bound)]
+            } else {
+                break;
             };
             self.range = tensor1(&range).into_arc_tensor();
             last = next.node;
@@ -220,8 +225,8 @@ impl<const TAPS: usize> WithSimd for Filter<'_, TAPS> {
             let sources = taps.map(|tap| &S::as_simd_f32s(&phases[tap..]).0[..sums.len()]);
             for (at, sum) in sums.iter_mut().enumerate() {
                 let mut value = bias;
-                for tap in 0..TAPS {
-                    value = simd.mul_add_e_f32s(sources[tap][at], kernel[tap], value);
+                for (source, weight) in sources.iter().zip(kernel) {
+                    value = simd.mul_add_e_f32s(source[at], weight, value);
                 }
                 // Keeps NaN, unlike a maximum.
                 value = simd.select_f32s(simd.less_than_f32s(value, low), low, value);
