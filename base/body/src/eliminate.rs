@@ -3,6 +3,7 @@
 
 use std::cmp::Ordering;
 use std::collections::BinaryHeap;
+use std::collections::binary_heap::PeekMut;
 
 use glam::Vec3;
 use rayon::prelude::*;
@@ -46,12 +47,14 @@ pub(crate) fn eliminate(points: &[Vec3], normals: &[Vec3], keep: usize, area: f6
     let mut alive = vec![true; points.len()];
     let mut left = points.len();
     while left > keep {
-        let Some(Entry { weight, index }) = heap.pop() else { break };
-        // Weights only fall: an outdated entry is too high and goes back to its place.
-        if weight > weights[index] {
-            heap.push(Entry { weight: weights[index], index });
+        let Some(mut highest) = heap.peek_mut() else { break };
+        let index = highest.index;
+        // Weights only fall: an outdated entry is too high and sinks to its place.
+        if highest.weight > weights[index] {
+            highest.weight = weights[index];
             continue;
         }
+        PeekMut::pop(highest);
         alive[index] = false;
         left -= 1;
         for &(neighbor, w) in &neighbors[index] {

@@ -2,6 +2,7 @@
 
 use std::cmp::Ordering;
 use std::collections::BinaryHeap;
+use std::collections::binary_heap::PeekMut;
 
 use flyrig_model::stretch::growth;
 use glam::{DVec3, Vec3};
@@ -169,18 +170,20 @@ impl Eq for Reached {}
 /// Selects points by farthest-point sampling along the surface. Each component gets its first node before any gets a second.
 fn farthest_points(links: &SurfaceLinks, count: usize, nodes: usize) -> Vec<u32> {
     let mut distance = vec![f32::INFINITY; count];
-    // Distances only fall: an outdated entry goes back to its place. Lower indices first.
+    // Distances only fall: an outdated entry sinks to its place. Lower indices first.
     let mut farthest: BinaryHeap<(Far, std::cmp::Reverse<u32>)> =
         (0..count as u32).map(|i| (Far(f32::INFINITY), std::cmp::Reverse(i))).collect();
     let mut chosen = Vec::with_capacity(nodes);
     let mut front = BinaryHeap::new();
     while chosen.len() < nodes {
-        let Some((Far(known), std::cmp::Reverse(gaussian))) = farthest.pop() else { break };
-        let now = distance[gaussian as usize];
-        if now < known {
-            farthest.push((Far(now), std::cmp::Reverse(gaussian)));
+        let Some(mut first) = farthest.peek_mut() else { break };
+        let (Far(known), std::cmp::Reverse(gaussian)) = &mut *first;
+        let (gaussian, now) = (*gaussian, distance[*gaussian as usize]);
+        if now < *known {
+            *known = now;
             continue;
         }
+        PeekMut::pop(first);
         chosen.push(gaussian);
         distance[gaussian as usize] = 0.0;
         front.push(Reached { distance: 0.0, gaussian, node: 0 });

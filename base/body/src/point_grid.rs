@@ -19,20 +19,20 @@ const MAX_CELLS: f64 = 16e6;
 /// assert_eq!(near, [1, 2]);
 /// ```
 #[derive(Debug)]
-pub struct PointGrid<'a> {
-    points: &'a [Vec3],
+pub struct PointGrid {
     origin: Vec3,
     cell: f32,
     size: IVec3,
     /// First point of each cell in `sorted`; one element more than cells.
     starts: Vec<u32>,
-    sorted: Vec<u32>,
+    /// Index and place of each point, by cells.
+    sorted: Vec<(u32, Vec3)>,
 }
 
-impl<'a> PointGrid<'a> {
+impl PointGrid {
     /// Sorts points into cubes of side `cell`, best the radius of later queries.
     #[must_use]
-    pub fn new(points: &'a [Vec3], cell: f32) -> Self {
+    pub fn new(points: &[Vec3], cell: f32) -> Self {
         let min = points.iter().copied().reduce(Vec3::min).unwrap_or(Vec3::ZERO);
         let max = points.iter().copied().reduce(Vec3::max).unwrap_or(Vec3::ZERO);
         let extent = (max - min).max(Vec3::splat(1e-6));
@@ -42,7 +42,8 @@ impl<'a> PointGrid<'a> {
             cell *= 1.3;
         }
         let size = (extent / cell).as_ivec3() + IVec3::ONE;
-        let mut grid = Self { points, origin: min, cell, size, starts: Vec::new(), sorted: vec![0; points.len()] };
+        let mut grid =
+            Self { origin: min, cell, size, starts: Vec::new(), sorted: vec![(0, Vec3::ZERO); points.len()] };
         let mut starts = vec![0u32; size.element_product() as usize + 1];
         for &point in points {
             starts[grid.index(grid.cell_of(point)) + 1] += 1;
@@ -53,7 +54,7 @@ impl<'a> PointGrid<'a> {
         let mut next = starts.clone();
         for (i, &point) in points.iter().enumerate() {
             let slot = &mut next[grid.index(grid.cell_of(point))];
-            grid.sorted[*slot as usize] = i as u32;
+            grid.sorted[*slot as usize] = (i as u32, point);
             *slot += 1;
         }
         grid.starts = starts;
@@ -77,8 +78,8 @@ impl<'a> PointGrid<'a> {
                 // Cells of a row lie side by side.
                 let first = self.starts[self.index(IVec3::new(low.x, y, z))] as usize;
                 let last = self.starts[self.index(IVec3::new(high.x, y, z)) + 1] as usize;
-                for &i in &self.sorted[first..last] {
-                    let squared = self.points[i as usize].distance_squared(centre);
+                for &(i, point) in &self.sorted[first..last] {
+                    let squared = point.distance_squared(centre);
                     if squared <= radius * radius {
                         visit(i as usize, squared);
                     }

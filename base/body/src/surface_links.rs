@@ -27,18 +27,23 @@ impl SurfaceLinks {
         for (i, &triangle) in gaussians.triangle.iter().enumerate() {
             on_triangle[triangle as usize].push(i as u32);
         }
+        let unseen = || vec![u32::MAX; template.triangles.len()];
         let nearest: Vec<Vec<(u32, f32)>> = on_triangle
             .par_iter()
             .enumerate()
-            .flat_map_iter(|(triangle, own)| {
+            .map_init(unseen, |seen, (triangle, own)| {
                 let near: Vec<u32> = match own.is_empty() {
                     true => Vec::new(),
-                    false => {
-                        mesh.around(triangle, reach).iter().flat_map(|&t| &on_triangle[t as usize]).copied().collect()
-                    }
+                    false => mesh
+                        .around(triangle, reach, seen)
+                        .iter()
+                        .flat_map(|&t| &on_triangle[t as usize])
+                        .copied()
+                        .collect(),
                 };
-                own.iter().map(move |&i| nearest_of(gaussians, i, &near, reach)).collect::<Vec<_>>()
+                own.iter().map(|&i| nearest_of(gaussians, i, &near, reach)).collect::<Vec<_>>()
             })
+            .flatten_iter()
             .collect();
         // In the order of the triangles; `order[k]` is the Gaussian of `nearest[k]`.
         let order: Vec<u32> = on_triangle.into_iter().flatten().collect();
@@ -127,10 +132,11 @@ impl MeshNeighborhoods {
         Self { corners, fan_starts, fans, centre, radius, area }
     }
 
-    /// Returns the triangles connected to one over shared corners within the ball of `reach` around it.
-    fn around(&self, triangle: usize, reach: f32) -> Vec<u32> {
+    /// Returns the triangles connected to one over shared corners within the ball of `reach` around it. `seen` holds, for each triangle,
+    /// the last one around which it was found.
+    fn around(&self, triangle: usize, reach: f32, seen: &mut [u32]) -> Vec<u32> {
         let mut found = vec![triangle as u32];
-        let mut seen = std::collections::HashSet::from([triangle as u32]);
+        seen[triangle] = triangle as u32;
         let mut next = 0;
         while let Some(&current) = found.get(next) {
             next += 1;
@@ -138,8 +144,12 @@ impl MeshNeighborhoods {
                 let fan = self.fan_starts[corner as usize] as usize..self.fan_starts[corner as usize + 1] as usize;
                 for &other in &self.fans[fan] {
                     let i = other as usize;
+                    if seen[i] == triangle as u32 {
+                        continue;
+                    }
                     let gap = self.centre[i].distance(self.centre[triangle]) - self.radius[i] - self.radius[triangle];
-                    if gap <= reach && seen.insert(other) {
+                    if gap <= reach {
+                        seen[i] = triangle as u32;
                         found.push(other);
                     }
                 }

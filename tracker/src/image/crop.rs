@@ -79,20 +79,45 @@ impl Crop {
     /// Samples a crop of `net_side` x `net_side` pixels: RGB in 0..=1, row by row, black outside the image. Each value
     /// averages enough samples that a large crop does not alias.
     pub fn sample_square(&self, picture: &Rgb, net_side: usize) -> Vec<f32> {
-        let taps = ((self.side / net_side as f64).round() as usize).clamp(1, 4);
+        pulp::Arch::new().dispatch(Sampling { crop: *self, picture, net_side })
+    }
+
+    /// Returns the network's landmarks in pixels of the image.
+    pub fn keypoints(&self, output: &NetOutput) -> ViewKeypoints {
+        std::array::from_fn(|i| {
+            let landmark = output.landmarks[i];
+            Keypoint { pixel: self.to_image(DVec2::new(landmark.x, landmark.y)), confidence: landmark.confidence }
+        })
+    }
+}
+
+/// Samples of a crop, compiled for the processor's vector instructions.
+struct Sampling<'a> {
+    crop: Crop,
+    picture: &'a Rgb<'a>,
+    net_side: usize,
+}
+
+impl pulp::NullaryFnOnce for Sampling<'_> {
+    type Output = Vec<f32>;
+
+    #[inline(always)]
+    fn call(self) -> Vec<f32> {
+        let Self { crop, picture, net_side } = self;
+        let taps = ((crop.side / net_side as f64).round() as usize).clamp(1, 4);
         let mut rgb = Vec::with_capacity(net_side * net_side * 3);
         let weight = 1.0 / (255.0 * (taps * taps) as f32);
-        let origin = self.to_image_from(DVec2::ZERO, net_side);
-        let (right, down) =
-            (self.to_image_from(DVec2::X, net_side) - origin, self.to_image_from(DVec2::Y, net_side) - origin);
+        let place = |crop_px: DVec2| crop.to_image_from(crop_px, net_side);
+        let origin = place(DVec2::ZERO);
+        let (right, down) = (place(DVec2::X) - origin, place(DVec2::Y) - origin);
+        let tap = |t: usize| (t as f64 + 0.5) / taps as f64 - 0.5;
         for y in 0..net_side {
             for x in 0..net_side {
                 let mut sum = [0.0f32; 3];
                 for ty in 0..taps {
+                    let row = origin + down * (y as f64 + tap(ty));
                     for tx in 0..taps {
-                        let tap = |t: usize| (t as f64 + 0.5) / taps as f64 - 0.5;
-                        let at = origin + right * (x as f64 + tap(tx)) + down * (y as f64 + tap(ty));
-                        let color = picture.bilinear(at);
+                        let color = picture.bilinear(row + right * (x as f64 + tap(tx)));
                         for (s, c) in sum.iter_mut().zip(color) {
                             *s += c;
                         }
@@ -102,14 +127,6 @@ impl Crop {
             }
         }
         rgb
-    }
-
-    /// Returns the network's landmarks in pixels of the image.
-    pub fn keypoints(&self, output: &NetOutput) -> ViewKeypoints {
-        std::array::from_fn(|i| {
-            let landmark = output.landmarks[i];
-            Keypoint { pixel: self.to_image(DVec2::new(landmark.x, landmark.y)), confidence: landmark.confidence }
-        })
     }
 }
 
@@ -230,6 +247,43 @@ mod tests {
                 }
             }
         }
+    }
+
+    #[test]
+    fn samples_are_those_of_the_definition_and_poisoned_crops_are_black() {
+        let (width, height) = (37usize, 29usize);
+        let bytes: Vec<u8> = (0..width * height * 3).map(|i| ((i * 7919) % 251) as u8).collect();
+        let picture = Rgb { width, height, bytes: bytes.clone().into() };
+        let at = |x: i64, y: i64, k: usize| match (0..width as i64).contains(&x) && (0..height as i64).contains(&y) {
+            true => f64::from(bytes[(y as usize * width + x as usize) * 3 + k]),
+            false => 0.0,
+        };
+        let bilinear = |p: DVec2, k: usize| {
+            let (x, y, f) = (p.x.floor() as i64, p.y.floor() as i64, p - p.floor());
+            let row = |y: i64| at(x, y, k) * (1.0 - f.x) + at(x + 1, y, k) * f.x;
+            row(y) * (1.0 - f.y) + row(y + 1) * f.y
+        };
+        for (side, taps) in [(9.0, 1), (14.0, 1), (31.0, 2), (44.0, 3), (90.0, 4)] {
+            let turn = DVec2::from_angle(0.3 * side);
+            let crop = Crop { center: DVec2::new(17.3, 15.9), side, turn };
+            let samples = crop.sample_square(&picture, 16);
+            for (i, found) in samples.iter().enumerate() {
+                let (x, y, k) = (i / 3 % 16, i / 48, i % 3);
+                let tap = |t: usize| (t as f64 + 0.5) / taps as f64 - 0.5;
+                let places = (0..taps * taps).map(|t| {
+                    let pixel = DVec2::new(x as f64 + tap(t % taps), y as f64 + tap(t / taps));
+                    crop.to_image_from(pixel, 16)
+                });
+                let expected = places.map(|p| bilinear(p, k)).sum::<f64>() / (255 * taps * taps) as f64;
+                assert!((f64::from(*found) - expected).abs() < 1e-5, "{side} {i}: {found} {expected}");
+            }
+        }
+        for poison in [f64::NAN, f64::INFINITY, f64::NEG_INFINITY] {
+            let crop = Crop { center: DVec2::new(poison, 15.0), side: 16.0, turn: DVec2::X };
+            assert!(crop.sample_square(&picture, 16).iter().all(|value| *value == 0.0));
+        }
+        let empty = Rgb { width: 0, height: 0, bytes: Vec::new().into() };
+        assert!(Crop::upright(DVec2::ZERO, 8.0).sample_square(&empty, 16).iter().all(|value| *value == 0.0));
     }
 
     #[test]

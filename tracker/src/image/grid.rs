@@ -1,7 +1,5 @@
 //! One-channel float images: drawing of meshes, distances, box and guided filters (He et al. 2010), connected components.
 
-use std::ops::Range;
-
 use flyrig_types::Mask;
 use glam::DVec2;
 use rayon::prelude::*;
@@ -37,46 +35,47 @@ impl Grid {
     }
 
     fn fill_triangles(&mut self, triangles: &[[DVec2; 3]]) {
-        let (width, height) = (self.width, self.height);
-        let bands = self.values.par_chunks_mut((width * ROWS_A_TASK).max(1)).enumerate();
-        bands.for_each(|(band, values)| {
-            let first = band * ROWS_A_TASK;
-            let mut band = Band { width, rows: first..(first + ROWS_A_TASK).min(height), values };
-            triangles.iter().for_each(|&[a, b, c]| band.fill_triangle(a, b, c));
-        });
+        triangles.iter().for_each(|&[a, b, c]| self.fill_triangle(a, b, c));
+    }
+
+    /// Sets the pixels whose centre lies in a triangle, and the pixels of its corners, to 1.
+    fn fill_triangle(&mut self, a: DVec2, b: DVec2, c: DVec2) {
+        let low = a.min(b).min(c);
+        let high = a.max(b).max(c);
+        // Ignores triangles that are not finite, too.
+        if !(high.y >= 0.0 && low.y < self.height as f64) {
+            return;
+        }
+        for corner in [a, b, c] {
+            if corner.x >= 0.0 && corner.y >= 0.0 {
+                let (x, y) = (corner.x as usize, corner.y as usize);
+                if x < self.width && y < self.height {
+                    self.values[y * self.width + x] = 1.0;
+                }
+            }
+        }
+        let clamp = |v: f64, end: usize| v.clamp(0.0, end as f64) as usize;
+        let columns = clamp(low.x.ceil(), self.width)..clamp(high.x.floor() + 1.0, self.width);
+        let rows = clamp(low.y.ceil(), self.height)..clamp(high.y.floor() + 1.0, self.height);
+        // Most triangles of a body lie between the centres of pixels.
+        if columns.is_empty() || rows.is_empty() {
+            return;
+        }
+        let turned = if (b - a).perp_dot(c - a) < 0.0 { -1.0 } else { 1.0 };
+        let sides = [(a, (b - a) * turned), (b, (c - b) * turned), (c, (a - c) * turned)];
+        for y in rows {
+            let from = sides.map(|(from, side)| side.x * (y as f64 - from.y) + side.y * from.x);
+            let inside = |x: usize| (0..3).all(|k| from[k] - sides[k].1.y * x as f64 >= 0.0);
+            let Some(first) = columns.clone().find(|x| inside(*x)) else { continue };
+            for x in (first..columns.end).take_while(|x| inside(*x)) {
+                self.values[y * self.width + x] = 1.0;
+            }
+        }
     }
 
     /// Returns the chamfer distance of each pixel (weights 3 and 4, over 3) to the nearest one above one half, pixels.
     pub fn distance_to_set(&self) -> Self {
-        const SIDE: f32 = 1.0;
-        const DIAGONAL: f32 = 4.0 / 3.0;
-        // From the row before: no pixel depends on its neighbour, so that this is vectorised.
-        let across = |row: &mut [f32], before: &[f32]| {
-            row.iter_mut().zip(before).for_each(|(d, before)| *d = d.min(before + SIDE));
-            row.iter_mut().skip(1).zip(before).for_each(|(d, before)| *d = d.min(before + DIAGONAL));
-            row.iter_mut().zip(before.iter().skip(1)).for_each(|(d, before)| *d = d.min(before + DIAGONAL));
-        };
-        let along = |last: f32, d: &mut f32| {
-            *d = d.min(last + SIDE);
-            *d
-        };
-        let far = (self.width + self.height) as f32 * 2.0;
-        let start = |value: &f32| if *value > 0.5 { 0.0 } else { far };
-        let mut out = Self { values: self.values.iter().map(start).collect(), ..*self };
-        let width = self.width;
-        for y in 0..self.height {
-            let (above, rest) = out.values.split_at_mut(y * width);
-            let row = &mut rest[..width];
-            across(row, &above[above.len().saturating_sub(width)..]);
-            row.iter_mut().fold(far, along);
-        }
-        for y in (0..self.height).rev() {
-            let (rest, below) = out.values.split_at_mut((y + 1) * width);
-            let row = &mut rest[y * width..];
-            across(row, &below[..width.min(below.len())]);
-            row.iter_mut().rev().fold(far, along);
-        }
-        out
+        pulp::Arch::new().dispatch(Distances(self))
     }
 
     /// Returns the mean over a square of `2 radius + 1` pixels around each pixel, cut off at the border.
@@ -84,29 +83,7 @@ impl Grid {
         if self.values.is_empty() {
             return self.clone();
         }
-        let (width, height) = (self.width, self.height);
-        let mut across = self.clone();
-        for (from, to) in self.values.chunks_exact(width).zip(across.values.chunks_exact_mut(width)) {
-            running_mean(from, to, radius);
-        }
-        // All columns at once, row by row.
-        let mut out = across.clone();
-        let mut sums = vec![0.0f64; width];
-        let row = |y: usize| &across.values[y * width..(y + 1) * width];
-        for y in 0..radius.min(height) {
-            sums.iter_mut().zip(row(y)).for_each(|(sum, entering)| *sum += f64::from(*entering));
-        }
-        for (y, means) in out.values.chunks_exact_mut(width).enumerate() {
-            if y + radius < height {
-                sums.iter_mut().zip(row(y + radius)).for_each(|(sum, entering)| *sum += f64::from(*entering));
-            }
-            if y > radius {
-                sums.iter_mut().zip(row(y - radius - 1)).for_each(|(sum, leaving)| *sum -= f64::from(*leaving));
-            }
-            let share = 1.0 / ((y + radius + 1).min(height) - y.saturating_sub(radius)) as f64;
-            means.iter_mut().zip(&sums).for_each(|(mean, sum)| *mean = (sum * share) as f32);
-        }
-        out
+        pulp::Arch::new().dispatch(BoxMean(self, radius))
     }
 
     /// Smooths along the edges of `guide` by the guided filter (He et al. 2010) with a window of `2 radius + 1` pixels and
@@ -145,62 +122,109 @@ impl Grid {
     }
 }
 
-/// Consecutive rows of a grid.
-struct Band<'a> {
-    width: usize,
-    rows: Range<usize>,
-    values: &'a mut [f32],
-}
+/// [`Grid::distance_to_set`], compiled for the processor's vector instructions.
+struct Distances<'a>(&'a Grid);
 
-impl Band<'_> {
-    /// Sets the pixels whose centre lies in a triangle, and the pixels of its corners, to 1.
-    fn fill_triangle(&mut self, a: DVec2, b: DVec2, c: DVec2) {
-        let low = a.min(b).min(c);
-        let high = a.max(b).max(c);
-        let rows = self.rows.clone();
-        // Ignores triangles that are not finite, too.
-        if !(high.y >= rows.start as f64 && low.y < rows.end as f64 + 1.0) {
-            return;
+impl pulp::NullaryFnOnce for Distances<'_> {
+    type Output = Grid;
+
+    #[inline(always)]
+    fn call(self) -> Grid {
+        // In thirds of pixels: sums of whole numbers are exact and take a processor less time than those of `f32`.
+        const SIDE: u32 = 3;
+        const DIAGONAL: u32 = 4;
+        // From the row before: no pixel depends on its neighbour, so that this is vectorised.
+        let across = |row: &mut [u32], before: &[u32]| {
+            let step = |d: &mut u32, before: &u32, step: u32| *d = (*d).min(before.wrapping_add(step));
+            row.iter_mut().zip(before).for_each(|(d, before)| step(d, before, SIDE));
+            row.iter_mut().skip(1).zip(before).for_each(|(d, before)| step(d, before, DIAGONAL));
+            row.iter_mut().zip(before.iter().skip(1)).for_each(|(d, before)| step(d, before, DIAGONAL));
+        };
+        let along = |last: u32, d: &mut u32| {
+            *d = (*d).min(last.wrapping_add(SIDE));
+            *d
+        };
+        let Grid { width, height, values } = self.0;
+        let (width, height) = (*width, *height);
+        // Small enough for any sum of steps.
+        let far = ((width + height) as u32).saturating_mul(2 * SIDE).min(u32::MAX / 2);
+        let mut thirds: Vec<u32> = values.iter().map(|value| if *value > 0.5 { 0 } else { far }).collect();
+        for y in 0..height {
+            let (above, rest) = thirds.split_at_mut(y * width);
+            let row = &mut rest[..width];
+            across(row, &above[above.len().saturating_sub(width)..]);
+            row.iter_mut().fold(far, along);
         }
-        let clamp = |v: f64, first: usize, end: usize| v.clamp(first as f64, end as f64) as usize;
-        for corner in [a, b, c] {
-            if corner.x >= 0.0 && corner.y >= 0.0 {
-                let (x, y) = (corner.x as usize, corner.y as usize);
-                if x < self.width && rows.contains(&y) {
-                    self.values[(y - rows.start) * self.width + x] = 1.0;
-                }
-            }
+        for y in (0..height).rev() {
+            let (rest, below) = thirds.split_at_mut((y + 1) * width);
+            let row = &mut rest[y * width..];
+            across(row, &below[..width.min(below.len())]);
+            row.iter_mut().rev().fold(far, along);
         }
-        let turned = if (b - a).perp_dot(c - a) < 0.0 { -1.0 } else { 1.0 };
-        let sides = [(a, (b - a) * turned), (b, (c - b) * turned), (c, (a - c) * turned)];
-        let columns = clamp(low.x.ceil(), 0, self.width)..clamp(high.x.floor() + 1.0, 0, self.width);
-        for y in clamp(low.y.ceil(), rows.start, rows.end)..clamp(high.y.floor() + 1.0, rows.start, rows.end) {
-            let from = sides.map(|(from, side)| side.x * (y as f64 - from.y) + side.y * from.x);
-            let inside = |x: usize| (0..3).all(|k| from[k] - sides[k].1.y * x as f64 >= 0.0);
-            let Some(first) = columns.clone().find(|x| inside(*x)) else { continue };
-            for x in (first..columns.end).take_while(|x| inside(*x)) {
-                self.values[(y - rows.start) * self.width + x] = 1.0;
-            }
-        }
+        Grid { width, height, values: thirds.into_iter().map(|thirds| thirds as f32 / 3.0).collect() }
     }
 }
 
-/// Writes the mean over `2 radius + 1` values around each value, cut off at the ends.
-fn running_mean(from: &[f32], to: &mut [f32], radius: usize) {
-    let mut sum: f64 = from.iter().take(radius).map(|v| f64::from(*v)).sum();
-    let whole = 1.0 / (2 * radius + 1) as f64;
-    for (i, out) in to.iter_mut().enumerate() {
-        if let Some(entering) = from.get(i + radius) {
-            sum += f64::from(*entering);
+/// [`Grid::box_mean`] of a grid with pixels, compiled for the processor's vector instructions.
+struct BoxMean<'a>(&'a Grid, usize);
+
+impl pulp::NullaryFnOnce for BoxMean<'_> {
+    type Output = Grid;
+
+    #[inline(always)]
+    fn call(self) -> Grid {
+        let Self(grid, radius) = self;
+        let (width, height) = (grid.width, grid.height);
+        let mut across = grid.clone();
+        let shares: Vec<f64> =
+            (0..width).map(|x| 1.0 / ((x + radius + 1).min(width) - x.saturating_sub(radius)) as f64).collect();
+        // Several rows side by side: one alone would wait for each of its sums. Zeros before and after enter and leave.
+        let mut columns = vec![[0.0f32; ROWS_AT_ONCE]; width + 2 * radius + 1];
+        let block = ROWS_AT_ONCE * width;
+        for (from, to) in grid.values.chunks(block).zip(across.values.chunks_mut(block)) {
+            for (row, from) in from.chunks_exact(width).enumerate() {
+                columns[radius + 1..].iter_mut().zip(from).for_each(|(column, value)| column[row] = *value);
+            }
+            let mut sums = [0.0f64; ROWS_AT_ONCE];
+            for column in &columns[radius + 1..2 * radius + 1] {
+                sums.iter_mut().zip(column).for_each(|(sum, entering)| *sum += f64::from(*entering));
+            }
+            // Column `x` is read for the last time before its mean is written there.
+            for (x, share) in shares.iter().enumerate() {
+                let (entering, leaving) = (columns[x + 2 * radius + 1], columns[x]);
+                columns[x] = std::array::from_fn(|row| {
+                    sums[row] = sums[row] + f64::from(entering[row]) - f64::from(leaving[row]);
+                    (sums[row] * share) as f32
+                });
+            }
+            for (row, to) in to.chunks_exact_mut(width).enumerate() {
+                to.iter_mut().zip(&columns).for_each(|(mean, column)| *mean = column[row]);
+            }
+            columns[..radius + 1].fill([0.0; ROWS_AT_ONCE]);
         }
-        if i > radius {
-            sum -= f64::from(from[i - radius - 1]);
+        // All columns at once, row by row.
+        let mut out = across.clone();
+        let mut sums = vec![0.0f64; width];
+        let nothing = vec![0.0f32; width];
+        let row = |y: usize| &across.values[y * width..(y + 1) * width];
+        for y in 0..radius.min(height) {
+            sums.iter_mut().zip(row(y)).for_each(|(sum, entering)| *sum += f64::from(*entering));
         }
-        let count = (i + radius + 1).min(from.len()) - i.saturating_sub(radius);
-        let share = if count == 2 * radius + 1 { whole } else { 1.0 / count as f64 };
-        *out = (sum * share) as f32;
+        for (y, means) in out.values.chunks_exact_mut(width).enumerate() {
+            let entering = if y + radius < height { row(y + radius) } else { &nothing };
+            let leaving = if y > radius { row(y - radius - 1) } else { &nothing };
+            let share = 1.0 / ((y + radius + 1).min(height) - y.saturating_sub(radius)) as f64;
+            for (((mean, sum), entering), leaving) in means.iter_mut().zip(&mut sums).zip(entering).zip(leaving) {
+                *sum = *sum + f64::from(*entering) - f64::from(*leaving);
+                *mean = (*sum * share) as f32;
+            }
+        }
+        out
     }
 }
+
+/// Rows whose running means are computed together.
+const ROWS_AT_ONCE: usize = 8;
 
 /// Finds the connected components (4 neighbours) of the pixels that `keep` accepts; calls `each` with the pixels of each.
 pub(crate) fn components(grid: &Grid, keep: impl Fn(f32) -> bool, mut each: impl FnMut(&[usize])) {
@@ -289,6 +313,8 @@ pub(crate) fn clean(grid: &mut Grid, hole_radius: usize) {
 
 #[cfg(test)]
 mod tests {
+    use std::ops::Range;
+
     use super::*;
 
     fn square(width: usize, height: usize, x: Range<usize>, y: Range<usize>) -> Grid {
@@ -303,19 +329,35 @@ mod tests {
 
     #[test]
     fn box_mean_equals_the_plain_sum() {
-        let grid = Grid { width: 7, height: 5, values: (0..35).map(|i| ((i * 7919) % 13) as f32).collect() };
-        let mean = grid.box_mean(2);
-        for y in 0..5usize {
-            for x in 0..7usize {
+        for (width, height, radius) in [(7, 5, 2), (1, 1, 3), (9, 24, 1), (40, 19, 12), (3, 16, 7), (0, 4, 1)] {
+            let value = |i: usize| ((i * 7919) % 13) as f32;
+            let grid = Grid { width, height, values: (0..width * height).map(value).collect() };
+            let mean = grid.box_mean(radius);
+            for (at, mean) in mean.values.iter().enumerate() {
+                let (x, y) = (at % width, at / width);
                 let (mut sum, mut count) = (0.0, 0.0);
-                for v in y.saturating_sub(2)..(y + 3).min(5) {
-                    for u in x.saturating_sub(2)..(x + 3).min(7) {
-                        sum += grid.values[v * 7 + u];
+                for v in y.saturating_sub(radius)..(y + radius + 1).min(height) {
+                    for u in x.saturating_sub(radius)..(x + radius + 1).min(width) {
+                        sum += f64::from(grid.values[v * width + u]);
                         count += 1.0;
                     }
                 }
-                assert!((mean.values[y * 7 + x] - sum / count).abs() < 1e-4);
+                assert!((f64::from(*mean) - sum / count).abs() < 1e-5);
             }
+        }
+    }
+
+    #[test]
+    fn poison_enters_means_with_its_rows_and_distances_stay_finite() {
+        for poison in [f32::NAN, f32::INFINITY, f32::NEG_INFINITY] {
+            let mut grid = Grid::new(20, 20, 1.0);
+            grid.values[15 * 20 + 10] = poison;
+            let mean = grid.box_mean(3);
+            assert!(mean.values[..12 * 20].iter().all(|mean| (mean - 1.0).abs() < 1e-6));
+            grid.values.iter_mut().filter(|value| value.is_finite()).for_each(|value| *value = 0.0);
+            let found = grid.distance_to_set();
+            assert!(found.values.iter().all(|d| d.is_finite()));
+            assert_eq!(found.values[15 * 20 + 10] < 0.5, poison > 0.5);
         }
     }
 
@@ -392,6 +434,30 @@ mod tests {
                 let is_corner = corners.iter().any(|corner| corner.floor() == p);
                 assert_eq!(grid.values[at] > 0.5, inside || is_corner, "{p}");
             }
+        }
+    }
+
+    #[test]
+    fn many_triangles_are_filled_as_one_by_one_and_poisoned_ones_are_left_out() {
+        let coordinate = |i: usize| ((i * 7919) % 4513) as f64 / 4513.0 * 60.0 - 10.0;
+        let mut places: Vec<Option<DVec2>> =
+            (0..300).map(|i| Some(DVec2::new(coordinate(2 * i), coordinate(2 * i + 1)))).collect();
+        places.extend([f64::NAN, f64::INFINITY, f64::NEG_INFINITY].map(|poison| Some(DVec2::new(20.0, poison))));
+        places.push(None);
+        let small = |i: u32| [i, (i + 57) % 300, (i + 111) % 300];
+        let triangles: Vec<[u32; 3]> = (0..40).map(|i| small(i * 7)).chain((300..305).map(|bad| [1, 2, bad])).collect();
+        let mut grid = Grid::new(40, 37, 0.0);
+        grid.fill_mesh(&places, &triangles);
+        let cross = |a: DVec2, b: DVec2, p: DVec2| (b - a).perp_dot(p - a);
+        for at in 0..40 * 37 {
+            let p = DVec2::new((at % 40) as f64, (at / 40) as f64);
+            let holds = |&[a, b, c]: &[u32; 3]| {
+                let [a, b, c] = [a, b, c].map(|corner| places[corner as usize].unwrap());
+                let sides = [cross(a, b, p), cross(b, c, p), cross(c, a, p)];
+                let inside = sides.iter().all(|s| *s >= 0.0) || sides.iter().all(|s| *s <= 0.0);
+                inside || [a, b, c].iter().any(|corner| corner.floor() == p)
+            };
+            assert_eq!(grid.values[at] > 0.5, triangles[..40].iter().any(holds), "{p}");
         }
     }
 

@@ -82,6 +82,7 @@ impl<'a> Rgb<'a> {
     }
 
     /// Samples bilinearly, 0..=255; black outside the image.
+    #[inline(always)]
     pub fn bilinear(&self, at: DVec2) -> [f32; 3] {
         if !(at.x > -1.0 && at.y > -1.0 && at.x < self.width as f64 && at.y < self.height as f64) {
             return [0.0; 3];

@@ -85,8 +85,10 @@ impl Body<'_> {
 
     /// Returns the vertices whose strongest joint is `joint` or hangs below it.
     fn vertices_below(&self, joint: usize) -> Vec<usize> {
+        let joints = 0..self.template.skeleton.joints().len();
+        let below: Vec<bool> = joints.map(|other| self.is_below(other, joint)).collect();
         let strongest = |vertex: usize| usize::from(self.template.skin[vertex].joints[0]);
-        (0..self.template.positions.len()).filter(|&vertex| self.is_below(strongest(vertex), joint)).collect()
+        (0..self.template.positions.len()).filter(|&vertex| below.get(strongest(vertex)) == Some(&true)).collect()
     }
 
     /// Returns the canonical position of a vertex, metres.

@@ -1,8 +1,8 @@
 //! Loads, runs and checks networks that take one crop of an image, through tract.
 //!
-//! Two operations of the loaded network are replaced: bilinear doublings (tract's own is slow, see
-//! [`upsample`](crate::network::upsample)) and the state of the vector registers after products
-//! ([`vector_state`](crate::network::vector_state)).
+//! Operations of the loaded network are replaced where tract's own are slow: depthwise convolutions
+//! ([`depthwise`](crate::network::depthwise)), bilinear doublings ([`upsample`](crate::network::upsample)), and the state of the
+//! vector registers after products ([`vector_state`](crate::network::vector_state)).
 
 use std::sync::Arc;
 
@@ -11,6 +11,7 @@ use tract_onnx::prelude::*;
 use tract_onnx::tract_hir::infer::Factoid as _;
 
 use crate::error::{TrackError, TrackErrorKind};
+use crate::network::depthwise::replace_depthwise;
 use crate::network::upsample::replace_doublings;
 use crate::network::vector_state::{clear_after_products, clear_upper_halves};
 
@@ -60,8 +61,11 @@ impl LandmarkNet {
         let shape = shape(&sides).map_err(failed)?;
         let model = model
             .with_input_fact(0, f32::fact(shape).into())
-            .and_then(InferenceModelExt::into_optimized)
+            .and_then(InferenceModelExt::into_typed)
+            .and_then(TypedModel::into_decluttered)
             .and_then(|mut model| {
+                replace_depthwise(&mut model)?;
+                let mut model = model.into_optimized()?;
                 replace_doublings(&mut model)?;
                 clear_after_products(&mut model)?;
                 model.into_runnable()

@@ -1,6 +1,7 @@
 //! Neural networks on crops of images: loading, running, and the pose networks built in or chosen by the user.
 
 mod chosen_net;
+mod depthwise;
 pub(crate) mod landmark_net;
 mod network_file;
 pub(crate) mod output;

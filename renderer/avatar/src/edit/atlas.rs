@@ -91,7 +91,7 @@ impl Shown {
     /// `radius`; `None` where none faces the same way. `grid` holds their positions, `colors` are linear RGB.
     pub fn color_at(
         &self,
-        grid: &PointGrid<'_>,
+        grid: &PointGrid,
         radius: f32,
         (place, normal): (Vec3, Vec3),
         colors: &[Vec3],

@@ -56,7 +56,7 @@ struct Canvas<'a> {
     texels: &'a [Texel],
     is_changed: Vec<bool>,
     edited: &'a [u8],
-    grid: PointGrid<'a>,
+    grid: PointGrid,
 }
 
 impl Avatar {
@@ -192,7 +192,7 @@ fn spread<'a>(texels: &'a [Texel], is_wanted: &[bool], apart: f32) -> Vec<&'a Te
 }
 
 /// Returns the Gaussian nearest to a point of the surface, and the mean height above it of those near, metres.
-fn height(grid: &PointGrid<'_>, shown: &Shown, place: Vec3, normal: Vec3, spacing: f32) -> Option<(usize, f32)> {
+fn height(grid: &PointGrid, shown: &Shown, place: Vec3, normal: Vec3, spacing: f32) -> Option<(usize, f32)> {
     let mut nearest = None;
     let (mut sum, mut weights) = (0.0, 0.0);
     grid.within(place, 2.0 * spacing, |i, squared| {

@@ -41,7 +41,7 @@ impl Avatar {
 }
 
 /// Returns the displacement of the vertex nearest to a point; zero without one within a metre.
-fn displacement_near(grid: &PointGrid<'_>, point: Vec3, displacement: &[Vec3]) -> Vec3 {
+fn displacement_near(grid: &PointGrid, point: Vec3, displacement: &[Vec3]) -> Vec3 {
     let mut radius = NEAR_M;
     while radius < 1.0 {
         let mut best = (f32::INFINITY, Vec3::ZERO);
