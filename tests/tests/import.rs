@@ -132,3 +132,21 @@ fn calibrations_of_other_names_and_sizes_are_fitted_and_doubts_are_named() {
     let unsure = command(&out, "import stranger --out new");
     assert!(unsure.stderr.contains("--name #00=a --name #01=b"), "{}", unsure.stderr);
 }
+
+#[test]
+fn cameras_without_footage_need_no_size_in_the_calibration() {
+    let data = write_dataset().unwrap();
+    for camera in ["03", "04", "05", "06"] {
+        fs::remove_dir_all(data.root.join("images").join(camera)).unwrap();
+    }
+    let file = data.root.join("intri.yml");
+    let sizes = ["H_", "W_"];
+    let lines = fs::read_to_string(&file).unwrap();
+    let without: Vec<&str> = lines.lines().filter(|line| !sizes.iter().any(|size| line.starts_with(size))).collect();
+    assert!(without.len() < lines.lines().count(), "{lines}");
+    fs::write(&file, without.join("\n")).unwrap();
+    let arguments = "eval data --frames 0..2 --gaussians 4000 --nodes 200 --trust-calibration";
+    let seen = command(data.root.parent().unwrap(), arguments);
+    assert_eq!(seen.code, Some(0), "{}", seen.stderr);
+    assert!(seen.stdout.contains("Three cameras: no number for new views can be given"), "{}", seen.stdout);
+}

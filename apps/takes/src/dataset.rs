@@ -118,14 +118,37 @@ pub fn load_rig(root: &Path, chosen: &[CameraId]) -> Result<Rig> {
 pub(crate) fn load_rig_of(calibration: &Path, images: &Path, chosen: &[CameraId]) -> Result<Rig> {
     require_calibration(calibration)?;
     let size = |id: &CameraId| image_size(images, id).or_else(|| image_size(calibration, id));
-    load_calibration(calibration, &size).or_else(|error| {
-        if matches!(error, CalibError::UnknownSize { .. }) {
-            for camera in chosen.iter().filter(|id| !video_file(images, id).exists()) {
-                folder_image_size(images, camera)?;
+    // Cameras that are not chosen and of which there are no images are left out later; any size reads them.
+    let (mut absent, present): (Vec<CameraId>, _) = (Vec::new(), cameras_with_images(images));
+    loop {
+        let any = || chosen.iter().chain(&present).find_map(size);
+        let read = |id: &CameraId| size(id).or_else(|| absent.contains(id).then(any).flatten());
+        match load_calibration(calibration, &read) {
+            Err(CalibError::UnknownSize { camera, .. })
+                if ![chosen, &present, &absent].iter().any(|known| known.contains(&camera)) && any().is_some() =>
+            {
+                absent.push(camera);
             }
+            Err(error) => {
+                if matches!(error, CalibError::UnknownSize { .. }) {
+                    for camera in chosen.iter().filter(|id| !video_file(images, id).exists()) {
+                        folder_image_size(images, camera)?;
+                    }
+                }
+                return Err(error.into());
+            }
+            Ok(rig) => return Ok(rig),
         }
-        Err(error.into())
-    })
+    }
+}
+
+/// Lists the cameras with a folder of images or a video.
+fn cameras_with_images(root: &Path) -> Vec<CameraId> {
+    let folders = std::fs::read_dir(root.join("images")).into_iter().flatten().flatten();
+    let folders = folders.filter(|entry| entry.path().is_dir());
+    let of_images = folders.map(|entry| CameraId::from(entry.file_name().to_string_lossy().into_owned()));
+    let videos = video_files(&root.join("videos")).unwrap_or_default();
+    of_images.chain(videos.iter().map(|file| video_camera(file))).collect()
 }
 
 /// Returns width and height of a camera's first readable image, or else of its video, pixels.

@@ -59,6 +59,7 @@ pub(super) fn match_take(rig: &Rig, plates: &[Option<Image>], take: Take, gpu: G
         world_up: rig.world_up,
     };
     let given_masks = take.given_masks;
+    let started = std::time::Instant::now();
     let sets = read_sets(&raw, take)?;
     let step = sets.len().div_ceil(SHAPE_SETS).max(1);
     let in_shape = |set: &&FrameSet| {
@@ -67,12 +68,14 @@ pub(super) fn match_take(rig: &Rig, plates: &[Option<Image>], take: Take, gpu: G
     };
     let first: Vec<FrameSet> = sets.iter().filter(in_shape).step_by(step).cloned().collect();
     let mut sampler = ColorSampler::new(&raw, plates, given_masks, 1, &first, gpu)?;
+    tracing::debug!(seconds = started.elapsed().as_secs_f64(), sets = sets.len(), "learned the shape for colours");
     let bar = flyrig_report::progress_bar(sets.len() as u64, "colours");
     for set in &sets {
         sampler.add(set, true)?;
         bar.inc(1);
     }
     bar.finish_and_clear();
+    tracing::debug!(seconds = started.elapsed().as_secs_f64(), "sampled colours");
     let points = sampler.into_points();
     ensure!(!points.is_empty(), "no person is tracked");
     let ids: Vec<CameraId> = raw.cameras.iter().map(|camera| camera.id.clone()).collect();

@@ -22,8 +22,12 @@ const CALIBRATION: &str = "calibration.toml";
 /// # Errors
 /// The calibration cannot be read, or the file cannot be written.
 pub fn mark_checked(root: &Path) -> Result<()> {
-    let rig = dataset::load_rig(root, &[])?;
-    write(root, &rig, &Value::Null, &[])
+    mark(root, &dataset::load_rig(root, &[])?)
+}
+
+/// Marks a calibration of a take folder as right.
+pub(super) fn mark(root: &Path, rig: &Rig) -> Result<()> {
+    write(root, rig, &Value::Null, &[])
 }
 
 /// Returns whether this calibration of a take was checked.

@@ -37,7 +37,7 @@ pub(super) struct Finding {
     pub fit: PersonFit,
     /// Time offsets that were adopted, seconds, one per slot; 0 otherwise.
     pub lags_s: Vec<f64>,
-    /// Kept-back disagreement with the old calibration, with new time offsets, and with new poses too.
+    /// Kept-back disagreement with the old calibration, with new time offsets (`None` where none are clear), and with new poses too.
     pub disagreement: [Option<f64>; 3],
 }
 
@@ -95,12 +95,17 @@ pub(super) fn measure(rigs: &[Rig], plates: Vec<Option<Image>>, take: Take, inst
 
 /// Adopts what pays on the frames that were kept back.
 fn adopt(rig: &Rig, tracks: &PersonTracks, choice: usize, both: PersonFit) -> Result<Finding> {
-    let fixed = PersonOptions { turn_sigma: FIXED, place_sigma_m: FIXED, ..PersonOptions::default() };
-    let timed = fit_person(rig, tracks, fixed)?;
+    // Offsets that are not clear beside free poses are not adopted without them either, which saves a solve.
+    let timed = if clear_lags(&both).is_some() {
+        let fixed = PersonOptions { turn_sigma: FIXED, place_sigma_m: FIXED, ..PersonOptions::default() };
+        Some(fit_person(rig, tracks, fixed)?)
+    } else {
+        None
+    };
     let before = both.kept_back.map(|(before, _)| before);
     let score = |fit: &PersonFit| Some(disagreement(fit.kept_back?.1, before?));
     let base = before.map(|before| disagreement(before, before));
-    let [of_timed, of_both] = [score(&timed), score(&both)];
+    let [of_timed, of_both] = [timed.as_ref().and_then(score), score(&both)];
     let mut finding = Finding {
         rig: rig.clone(),
         choice,
@@ -111,8 +116,8 @@ fn adopt(rig: &Rig, tracks: &PersonTracks, choice: usize, both: PersonFit) -> Re
         fit: both,
     };
     let Some(mut best) = base else { return Ok(finding) };
-    if let Some(score) = of_timed.filter(|score| *score < LAGS_PAY * best)
-        && let Some(lags_s) = clear_lags(&timed).filter(|_| are_same_lags(&timed, &finding.fit))
+    if let (Some(timed), Some(score)) = (&timed, of_timed.filter(|score| *score < LAGS_PAY * best))
+        && let Some(lags_s) = clear_lags(timed).filter(|_| are_same_lags(timed, &finding.fit))
     {
         (best, finding.adopts_lags, finding.lags_s) = (score, true, lags_s);
     }
@@ -126,7 +131,7 @@ fn adopt(rig: &Rig, tracks: &PersonTracks, choice: usize, both: PersonFit) -> Re
         let lags_s = clear_lags(&finding.fit);
         finding.adopts_lags = lags_s.is_some();
         finding.lags_s = lags_s.unwrap_or_else(|| vec![0.0; rig.cameras.len()]);
-    } else if finding.adopts_lags {
+    } else if let Some(timed) = timed.filter(|_| finding.adopts_lags) {
         finding.fit = timed;
     }
     for (camera, lag_s) in finding.rig.cameras.iter_mut().zip(&finding.lags_s) {

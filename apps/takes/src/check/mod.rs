@@ -77,7 +77,7 @@ pub fn check_take(root: &Path, fps: f64, gpu: &dyn Fn() -> Result<GpuContext>) -
         }
         Err(error) => {
             eprintln!("the calibration could not be checked and is used as it is: {error:#}");
-            mark_checked(root)
+            files::mark(root, &all)
         }
     }
 }

@@ -53,13 +53,13 @@ pub fn import(options: &ImportOptions, gpu: &dyn Fn() -> Result<GpuContext>) -> 
 /// Returns the calibration of the footage's cameras, with lenses for the size of their images. Where images were cropped or extended,
 /// two calibrations are possible.
 fn fit_sizes(found: &FoundFootage, calibration: &FoundCalibration, pairs: &[(usize, usize)]) -> Result<Vec<Rig>> {
+    let sizes = pairs.iter().map(|(slot, _)| found.cameras[*slot].size()).collect::<Result<Vec<_>>>()?;
     let mut rigs = Vec::new();
     for crop in [Crop::Cropped, Crop::Extended] {
         let (mut cameras, mut is_certain) = (Vec::new(), true);
-        for (slot, known) in pairs {
+        for ((slot, known), &size) in pairs.iter().zip(&sizes) {
             let source = &found.cameras[*slot];
             let mut camera = calibration.rig.cameras[*known].clone();
-            let size = source.size()?;
             camera.id = CameraId::from(source.name.as_str());
             if size != (camera.intrinsics.width, camera.intrinsics.height) {
                 let (lens, resize) = resize_lens(&camera.intrinsics, size, crop)
