@@ -80,7 +80,7 @@ fn a_simulated_capture_is_exported_once() {
     let exported = run(PROGRAM, &args, folder.path()).unwrap();
     assert_eq!(exported.code, Some(0), "{exported:?}");
     assert!(exported.stdout.contains("take: 2 frames of 3 cameras, 6 images"), "{}", exported.stdout);
-    assert!(exported.stdout.contains("flyrig eval take --inputs 00,02 --holdout 01 --fps 30"), "{}", exported.stdout);
+    assert!(exported.stdout.contains("score it with: flyrig eval take\n"), "{}", exported.stdout);
     for file in ["intri.yml", "images/02/000001.png", "truth/02/000001.exr", "truth/frames.csv", "subject.glb"] {
         assert!(folder.path().join("take").join(file).exists(), "{file}");
     }
