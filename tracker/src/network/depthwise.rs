@@ -392,7 +392,7 @@ mod tests {
             replace_depthwise(&mut model).unwrap();
             let model = model.into_optimized().unwrap();
             let left = model.nodes.iter().filter(|node| node.op_is::<TypedBinOp>()).count();
-            assert!(model.nodes.iter().any(|node| node.op_is::<Depthwise>()) && left == 0, "{model}");
+            assert!(model.nodes.iter().any(TypedNode::op_is::<Depthwise>) && left == 0, "{model}");
             self.run(model, input)
         }
 
