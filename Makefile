@@ -40,7 +40,7 @@ test-v4l2: setup
 
 test-browser: setup
 	@scripts/setup.sh chromium
-	$(CARGO) test --release --locked --workspace --test browser -- --ignored --nocapture
+	$(CARGO) test --release --locked --workspace --test browser -- --ignored --nocapture --test-threads 1
 
 soak: setup
 	$(CARGO) run --release --locked -q --bin flyrig-bench -- capture --minutes $(MINUTES)

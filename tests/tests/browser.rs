@@ -148,7 +148,7 @@ impl Shown {
         if self == Self::Person {
             let more = format!("[web]\nlisten = \"127.0.0.1:{web}\"\n");
             let endpoint = small_rig("browser", folder, &more);
-            let sim = "width = 384\nheight = 384\nfps = 4\nmotion.kind = \"still\"\n";
+            let sim = "width = 384\nheight = 384\nfps = 1\nmotion.kind = \"still\"\n";
             std::fs::write(folder.join("sim.toml"), sim).unwrap();
             let text = std::fs::read_to_string(&file).unwrap();
             std::fs::write(&file, text.replace("gaussians = 3000", "gaussians = 40000")).unwrap();
@@ -517,7 +517,7 @@ fn the_page_of_a_take_plays_from_the_file_system() {
     // Nothing but the one file is there.
     std::fs::copy(&page, alone.path().join("take.html")).unwrap();
     let port = std::net::TcpListener::bind("127.0.0.1:0").unwrap().local_addr().unwrap().port();
-    let url = format!("file://{}/take.html", alone.path().display());
+    let url = format!("file://{}/take.html?bare", alone.path().display());
     let mut browser = Browser::open(&url, folder, port, WEBGL2);
     let size = json!({ "width": SIDE, "height": SIDE, "deviceScaleFactor": 1, "mobile": false });
     browser.call("Emulation.setDeviceMetricsOverride", &size);

@@ -168,6 +168,7 @@ addEventListener("keydown", event => {
 
 // --- Images ---
 
+const hasFloor = !new URLSearchParams(location.search).has("bare");
 let lastTick = performance.now();
 let isFramed = false;
 
@@ -196,7 +197,7 @@ function tick(now) {
   drawing.setColors(list(wasm.colors()), count);
   if (rotations) drawing.setScales(list(wasm.scales()), count);
   const shadow = wasm.shadow(), side = wasm.shadow_side();
-  if (shadow) drawing.setFloor(new Float32Array(wasm.memory.buffer, wasm.floor(), 12), new Uint8Array(wasm.memory.buffer, shadow, side * side), side);
+  if (shadow && hasFloor) drawing.setFloor(new Float32Array(wasm.memory.buffer, wasm.floor(), 12), new Uint8Array(wasm.memory.buffer, shadow, side * side), side);
   drawing.draw(new Float32Array(wasm.memory.buffer, wasm.camera(), 19), BACKGROUND, new Uint32Array(wasm.memory.buffer, order, wasm.order_length()));
   [uploaded, dirty] = [true, false];
   document.documentElement.dataset.frame = wasm.frame();
