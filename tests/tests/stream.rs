@@ -113,6 +113,11 @@ fn a_viewer_draws_the_person_as_the_rig_does_live_and_from_a_recording() {
     let play = ["play", "take.mcap", "--rig", "again", "--listen", &endpoint, "--repeat", "--wait"];
     let _play = Process::start(PROGRAM, &play, folder.path(), "play");
     let receiver = Receiver::start(&config("again", &endpoint), || {}).unwrap();
+    // The rig's cameras and the age of its people arrive by themselves, in any order.
+    wait_until("the played rig's cameras and age", || {
+        let state = receiver.state();
+        state.rig.is_some() && state.age.is_some()
+    });
     let (_, played) = view(&receiver, &gpu, &camera);
     let played = flyrig_renderer::composite_over(&played.rgba, &vec![30; played.rgba.len() / 4 * 3]);
     let psnr =
