@@ -3,8 +3,10 @@
 mod command;
 mod dataset;
 pub mod guide;
+mod ports;
 mod running;
 
 pub use command::{Finished, run};
 pub use dataset::{Dataset, FRAMES, SIDE, copy_folder, write_dataset, write_dataset_of};
+pub use ports::free_port;
 pub use running::Running;

@@ -13,7 +13,7 @@ use std::{
 };
 
 use flyrig_tests::{
-    Running, copy_folder,
+    Running, copy_folder, free_port,
     guide::{Block, blocks},
     run,
 };
@@ -28,8 +28,8 @@ const SEEN_SIM: &str = "width = 160\nheight = 160\ntexture_px = 256\n";
 /// Lengths and cameras in the guide, and those of the test.
 const SHORTER: [(&str, &str); 13] = [
     ("--seconds 60", "--seconds 6"),
-    ("--seconds 20", "--seconds 2"),
-    ("--seconds 10", "--seconds 2"),
+    ("--seconds 20", "--seconds 8"),
+    ("--seconds 10", "--seconds 8"),
     ("--seconds 30", "--seconds 20"),
     ("--frames 60", "--frames 4"),
     ("--frames 0..60", "--frames 0..4"),
@@ -224,9 +224,9 @@ impl Reader {
         });
         self.clear(&args);
         let endpoint = self.endpoint.clone();
-        let own_endpoint = free_endpoint();
+        let own_endpoint = format!("tcp/127.0.0.1:{}", free_port());
         match args[0] {
-            "watch" if args.contains(&"--record") => args.extend(["--connect", &endpoint, "--seconds", "10"]),
+            "watch" if args.contains(&"--record") => args.extend(["--connect", &endpoint, "--seconds", "20"]),
             "watch" => args.extend(["--connect", &endpoint, "--count", "2"]),
             "serve" => args.extend(["--connect", &endpoint, "--listen", "127.0.0.1:0"]),
             "play" if !args.contains(&"--orbit") => args.extend(["--listen", &own_endpoint]),
@@ -296,7 +296,11 @@ impl Reader {
     fn stop(&mut self) {
         while let Some((line, mut process)) = self.running.pop() {
             if process.0.try_wait().unwrap().is_none() {
-                // A recording has its first frames by then.
+                // A recording has its first frames by then: more bytes than the calibration before them.
+                if let Some((_, recording)) = line.split_once(" --record ") {
+                    let path = self.path().join(recording.split(' ').next().unwrap());
+                    wait_until("frames of the recording", || fs::metadata(&path).is_ok_and(|file| file.len() > 50_000));
+                }
                 std::thread::sleep(Duration::from_secs(2));
                 let killed = Command::new("kill").args(["-INT", &process.0.id().to_string()]).status().unwrap();
                 assert!(killed.success(), "{line}");
@@ -305,12 +309,6 @@ impl Reader {
             assert!(status.success(), "{line}: {status}");
         }
     }
-}
-
-/// Returns an endpoint on a free port of this computer.
-fn free_endpoint() -> String {
-    let port = std::net::TcpListener::bind("127.0.0.1:0").unwrap().local_addr().unwrap().port();
-    format!("tcp/127.0.0.1:{port}")
 }
 
 /// Follows a page; `prepare` makes what its reader has beyond the supplies.

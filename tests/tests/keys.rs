@@ -1,20 +1,11 @@
 //! Keys from the command line: a key file alone lets another computer watch the rig or send cameras.
 #![allow(clippy::unwrap_used, clippy::panic)] // a test may fail by panicking, in its helpers too
 
-use std::{
-    net::TcpListener,
-    process::{Command, Stdio},
-};
+use std::process::{Command, Stdio};
 
-use flyrig_tests::{Running, run};
+use flyrig_tests::{Running, free_port, run};
 
 const PROGRAM: &str = env!("CARGO_BIN_EXE_flyrig-under-test");
-
-/// Returns a free port whose successor is free too.
-fn free_port() -> u16 {
-    let port = || TcpListener::bind("0.0.0.0:0").unwrap().local_addr().unwrap().port();
-    (0..100).map(|_| port()).find(|port| TcpListener::bind(("0.0.0.0", port + 1)).is_ok()).unwrap()
-}
 
 #[test]
 fn a_key_file_is_all_that_another_computer_needs() {
@@ -71,21 +62,30 @@ fn a_key_file_is_all_that_another_computer_needs() {
     refused(&["record", "other.toml", "--out", "x.mcap", "--seconds", "1"], "of the rig 'stage', not of 'hall'");
     let take = |n: u32| format!("take{n}.mcap");
     let sets = |n: u32| {
-        done(&["record", "rig.toml", "--out", &take(n), "--seconds", "4"]);
+        // A recording without any frame is not kept.
+        let recorded = command(&["record", "rig.toml", "--out", &take(n), "--seconds", "4"]);
+        let is_empty = recorded.stderr.contains("no frame was recorded");
+        assert_eq!(recorded.code, Some(i32::from(is_empty)), "{recorded:?}");
         let replayed = command(&["replay", &take(n)]).stdout;
         replayed.lines().find_map(|line| line.strip_prefix("sets: ")?.split(' ').next()?.parse::<usize>().ok())
     };
-    assert!((0..8).filter_map(sets).any(|complete| complete > 3), "no frame sets arrived");
+    assert!((0..20).filter_map(sets).any(|complete| complete > 3), "no frame sets arrived");
 
     // Revoke the key, then renew it.
     done(&["keys", "revoke", "left-pc"]);
     assert!(
         done(&["keys", "list"]).stdout.lines().any(|line| line.starts_with("left-pc") && line.ends_with("revoked"))
     );
-    let silent = command(&["record", "rig.toml", "--out", "none.mcap", "--seconds", "3"]);
-    for part in ["its key was revoked", "run `flyrig capture rig.toml --key KEY` on it"] {
-        assert!(silent.code == Some(1) && silent.stderr.contains(part), "{}", silent.stderr);
-    }
+    // The camera computer tries its key again after a while.
+    let mut silent = String::new();
+    let is_told = (0..20).any(|_| {
+        let recorded = command(&["record", "rig.toml", "--out", "none.mcap", "--seconds", "3"]);
+        assert_eq!(recorded.code, Some(1), "{recorded:?}");
+        silent = recorded.stderr;
+        let parts = ["its key was revoked", "run `flyrig capture rig.toml --key KEY` on it"];
+        parts.iter().all(|part| silent.contains(part))
+    });
+    assert!(is_told, "{silent}");
     drop(cameras);
     std::fs::remove_file(folder.path().join("desk.key")).unwrap();
     let renewed = done(&["keys", "renew", "desk"]);
@@ -155,7 +155,11 @@ fn commands_that_are_killed_leave_keys_and_list_equal() {
     let started = std::time::Instant::now();
     drop(run(PROGRAM, &["keys", "add", "desk"], path).unwrap());
     let whole = started.elapsed();
-    for n in 0..40u32 {
+    // More than forty where the machine has become slower meanwhile, until one is not killed.
+    for n in 0..400u32 {
+        if n >= 40 && key_files(path).len() > 1 {
+            break;
+        }
         // Killed at moments spread over the time that the command takes.
         let command = spawn(&["keys", "add", &format!("new{n:02}")], path);
         std::thread::sleep(whole * n / 30);

@@ -4,22 +4,18 @@
 
 use std::{
     io::{Read as _, Write as _},
-    net::{TcpListener, TcpStream},
+    net::TcpStream,
     os::unix::net::UnixDatagram,
     path::Path,
     process::{Command, Stdio},
     time::{Duration, Instant},
 };
 
-use flyrig_tests::{Running, run};
+use flyrig_tests::{Running, free_port, run};
 
 const PROGRAM: &str = env!("CARGO_BIN_EXE_flyrig-under-test");
 /// Timeout, far longer than any step takes: a hang fails the test.
 const PATIENCE: Duration = Duration::from_secs(90);
-
-fn free_port() -> u16 {
-    TcpListener::bind("127.0.0.1:0").unwrap().local_addr().unwrap().port()
-}
 
 /// Writes a calibration, and a configuration of one camera that is not plugged in.
 fn write_rig(folder: &Path, health: u16) {
@@ -75,13 +71,18 @@ fn a_rig_starts_without_its_camera_and_says_so() {
         let length = manager.recv(&mut bytes).unwrap();
         states += &String::from_utf8_lossy(&bytes[..length]);
     }
-    let metrics = page(health).unwrap();
-    for line in [
+    // The page is published a moment after the status, and a machine that pauses may break an answer off.
+    let lines = [
         "flyrig_camera_up{camera=\"00\"} 0",
         "flyrig_thread_restarts_total{thread=\"camera 00\"} 0",
         "flyrig_thread_stuck{thread=\"camera 00\"} 0",
-    ] {
-        assert!(metrics.contains(line), "{line} in\n{metrics}");
+    ];
+    let deadline = Instant::now() + PATIENCE;
+    loop {
+        let metrics = page(health).unwrap_or_default();
+        let Some(missing) = lines.iter().find(|line| !metrics.contains(**line)) else { break };
+        assert!(Instant::now() < deadline, "{missing} in\n{metrics}");
+        std::thread::sleep(Duration::from_millis(50));
     }
     assert!(rig.0.try_wait().unwrap().is_none(), "the rig must keep running");
     let id = rig.0.id().to_string();

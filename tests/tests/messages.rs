@@ -7,7 +7,7 @@ use std::{
     path::{Path, PathBuf},
 };
 
-use flyrig_tests::{Finished, copy_folder, guide::words, run};
+use flyrig_tests::{Finished, copy_folder, free_port, guide::words, run};
 
 const PROGRAM: &str = env!("CARGO_BIN_EXE_flyrig-under-test");
 
@@ -58,7 +58,7 @@ impl Inputs {
     fn new() -> Self {
         let folder = tempfile::tempdir().unwrap();
         let taken = TcpListener::bind("127.0.0.1:0").unwrap();
-        let free = TcpListener::bind("127.0.0.1:0").unwrap().local_addr().unwrap().port();
+        let free = free_port();
         let inputs = Self { folder, free, taken };
         inputs.write("sim.toml", "width = 96\nheight = 96\ntexture_px = 128\ncameras.count = 4\n");
         inputs.make(&["sim", "export", "sim.toml", "--out", "take", "--frames", "4", "--no-truth"]);

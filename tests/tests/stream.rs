@@ -8,10 +8,10 @@ use std::time::{Duration, Instant};
 use flyrig_capture::{CameraSource as _, VideoOptions, VideoReplay};
 use flyrig_gpu::{AdapterChoice, GpuContext};
 use flyrig_stream::Posed;
-use flyrig_tests::run;
+use flyrig_tests::{free_port, run};
 use flyrig_transport::{Interests, Subscriber, TransportConfig, Views};
 use flyrig_viewer::{PeopleScene, Receiver, clock_secs};
-use support::{PATIENCE, Process, SMALL_SIM, small_rig, wait_until};
+use support::{PATIENCE, Process, SMALL_SIM, small_rig, wait_for, wait_until};
 
 const PROGRAM: &str = env!("CARGO_BIN_EXE_flyrig-under-test");
 
@@ -21,18 +21,15 @@ fn config(rig: &str, endpoint: &str) -> TransportConfig {
 
 /// Draws the received people through a camera, once the viewer has all colours.
 fn view(receiver: &Receiver, gpu: &GpuContext, camera: &flyrig_types::Camera) -> (u64, flyrig_types::RenderedView) {
-    wait_until("a person with all colours", || {
-        let state = receiver.state();
-        state
-            .people
-            .get(0)
-            .is_some_and(|person| person.is_complete() && person.motion_at(clock_secs(), false).is_some())
+    // Nobody is shown while the rig of a busy machine pauses.
+    let (motion, posed, colors) = wait_for("a person with all colours", || {
+        let mut state = receiver.state();
+        let person = state.people.get_mut(0).filter(|person| person.is_complete())?;
+        let motion = person.motion_at(clock_secs(), false)?;
+        let mut posed = Posed::default();
+        let colors = person.pose(&motion, &mut posed);
+        Some((motion, posed, colors))
     });
-    let mut state = receiver.state();
-    let person = state.people.get_mut(0).unwrap();
-    let motion = person.motion_at(clock_secs(), false).unwrap();
-    let mut posed = Posed::default();
-    let colors = person.pose(&motion, &mut posed);
     let mut scene = PeopleScene::new(&gpu.fastest()).unwrap();
     scene.set_people([(&posed, colors.as_slice())]).unwrap();
     (motion.stamp.frame, scene.draw(camera).unwrap())
@@ -56,12 +53,11 @@ fn a_viewer_draws_the_person_as_the_rig_does_live_and_from_a_recording() {
         "record",
     );
     let mut rig = Process::start(PROGRAM, &["run", "rig.toml"], folder.path(), "run");
-    wait_until("the rig's cameras", || receiver.state().rig.is_some());
-    let mut camera = receiver.state().rig.clone().unwrap().cameras[0].clone();
+    let mut camera = wait_for("the rig's cameras", || receiver.state().rig.clone()).cameras[0].clone();
     // Request the rig's own view through the same lens.
     camera.intrinsics.lens = flyrig_types::Lens::PINHOLE;
     let (frame, ours) = view(&receiver, &gpu, &camera);
-    assert!(receiver.state().trouble("stream", &endpoint).is_none());
+    wait_until("no more trouble", || receiver.state().trouble("stream", &endpoint).is_none());
     let pictures =
         Subscriber::open(&config("stream", &endpoint), &Interests { views: Views::None, ..Interests::default() })
             .unwrap();
@@ -83,9 +79,7 @@ fn a_viewer_draws_the_person_as_the_rig_does_live_and_from_a_recording() {
     assert!(shown > 300, "{shown} pixels");
     // A recording of a few seconds.
     let captured = || receiver.state().people.get(0)?.motion_at(clock_secs(), false).map(|m| m.stamp.capture_nanos);
-    // Nobody is shown while the rig of a busy machine pauses.
-    wait_until("a motion", || captured().is_some());
-    let start = captured().unwrap();
+    let start = wait_for("a motion", captured);
     wait_until("a recording longer than a refresh", || captured().is_some_and(|now| now > start + 4_000_000_000));
     rig.signal("INT");
     wait_until("the rig to end", || rig.0.try_wait().unwrap().is_some());
@@ -108,15 +102,14 @@ fn a_viewer_draws_the_person_as_the_rig_does_live_and_from_a_recording() {
     }
     assert!(images > 50 && last_nanos > 7_900_000_000, "{images} images, {last_nanos} ns: less than a turn");
     // Another rig plays the same person from the file.
-    let port = std::net::TcpListener::bind("127.0.0.1:0").unwrap().local_addr().unwrap().port();
-    let endpoint = format!("tcp/127.0.0.1:{port}");
+    let endpoint = format!("tcp/127.0.0.1:{}", free_port());
     let play = ["play", "take.mcap", "--rig", "again", "--listen", &endpoint, "--repeat", "--wait"];
     let _play = Process::start(PROGRAM, &play, folder.path(), "play");
     let receiver = Receiver::start(&config("again", &endpoint), || {}).unwrap();
-    // The rig's cameras and the age of its people arrive by themselves, in any order.
-    wait_until("the played rig's cameras and age", || {
+    // The rig's cameras, and the statistics without which no age is exact, arrive by themselves, in any order.
+    wait_until("the played rig's cameras and an exact age", || {
         let state = receiver.state();
-        state.rig.is_some() && state.age.is_some()
+        state.rig.is_some() && state.age.is_some_and(|(_, is_exact)| is_exact)
     });
     let (_, played) = view(&receiver, &gpu, &camera);
     let played = flyrig_renderer::composite_over(&played.rgba, &vec![30; played.rgba.len() / 4 * 3]);

@@ -52,7 +52,7 @@ fn the_calibrations_time_offset_is_applied_and_can_be_replaced() {
     let command = |args: &[&str]| run(PROGRAM, args, folder.path()).unwrap();
     std::fs::write(folder.path().join("rig.toml"), RIG).unwrap();
     std::fs::write(folder.path().join("sim.toml"), format!("{SIM}{FAULT}")).unwrap();
-    let exported = command(&["record", "rig.toml", "--out", "take.mcap", "--seconds", "60"]);
+    let exported = command(&["record", "rig.toml", "--out", "take.mcap", "--seconds", "600"]);
     assert_eq!(exported.code, Some(0), "{exported:?}");
     std::fs::write(folder.path().join("sim.toml"), SIM).unwrap();
     let frames = command(&["sim", "export", "sim.toml", "--out", "room", "--frames", "1"]);

@@ -55,7 +55,8 @@ fn an_opening_that_hangs_holds_up_neither_the_others_nor_the_end() {
     assert!(late.running && !late.opened, "{late:?}");
     let text = late.last_error.unwrap().to_string();
     assert!(text.starts_with("camera hangs: was not opened within 5 s"), "{text}");
-    assert_eq!(threads.stuck(Duration::from_secs(4)), ["open hangs"]);
+    // A machine that pauses makes others look stuck for a moment.
+    until(&threads, "hangs", "it alone is stuck", |_| threads.stuck(Duration::from_secs(4)) == ["open hangs"]);
     flows(&threads, "good");
     dropped(threads);
     assert_eq!(calls.load(Ordering::SeqCst), 1, "no second thread went into the driver");
@@ -107,7 +108,7 @@ fn a_source_that_panics_is_opened_anew_up_to_a_cap() {
             counted.fetch_add(1, Ordering::SeqCst);
             Ok(source("bad", frames(3), step.clone()))
         });
-        let threads = CaptureThreads::start_opening(vec![opener, healthy("good")], live(10_000)).unwrap();
+        let threads = CaptureThreads::start_opening(vec![opener, healthy("good")], live(100_000)).unwrap();
         until(&threads, "bad", "it is opened again", |stats| stats.restarts == 5);
         let capped = until(&threads, "bad", "the last one fails", |stats| stats.errors.values().sum::<u64>() == 6);
         flows(&threads, "good");
@@ -121,7 +122,7 @@ fn a_source_that_panics_is_opened_anew_up_to_a_cap() {
             assert!(text.starts_with("camera bad: its source failed inside: "), "{text}");
             assert!(text.ends_with("panic; opening it again"), "{text}");
         }
-        assert!(threads.stuck(Duration::from_secs(5)).is_empty(), "a pause is not a hang");
+        until(&threads, "bad", "a pause is not a hang", |_| threads.stuck(Duration::from_secs(5)).is_empty());
         let queue = Arc::clone(threads.queue());
         dropped(threads);
         let numbers = std::iter::from_fn(|| queue.pop(Duration::ZERO).ok());

@@ -7,7 +7,7 @@ use std::{
         Arc,
         atomic::{AtomicBool, AtomicUsize, Ordering},
     },
-    time::Duration,
+    time::{Duration, Instant},
 };
 
 use flyrig_capture::{
@@ -149,12 +149,21 @@ impl CameraSource for Tenths {
 
 #[test]
 fn a_recording_played_as_live_does_not_overtake_itself() {
-    let sources = vec![Box::new(Tenths(Fast::boxed("a", 12, &Arc::default(), grey))) as Box<dyn CameraSource>];
-    let config = ThreadsConfig { queue_capacity: 12, pacing: Pacing::RealTime };
-    let threads = CaptureThreads::start_staged(sources, |_| Box::new(Decoding::new(None)), config).unwrap();
-    let frames = drain(&threads).len();
-    // A stage that the machine stops for a tenth of a second may lose one.
-    assert!(frames >= 9, "{frames} of 12 frames are left");
+    let end = Instant::now() + LONG;
+    loop {
+        let begun = Instant::now();
+        let sources = vec![Box::new(Tenths(Fast::boxed("a", 12, &Arc::default(), grey))) as Box<dyn CameraSource>];
+        let config = ThreadsConfig { queue_capacity: 12, pacing: Pacing::RealTime };
+        let threads = CaptureThreads::start_staged(sources, |_| Box::new(Decoding::new(None)), config).unwrap();
+        let frames = drain(&threads).len();
+        // A stage that the machine stops for a tenth of a second may lose one.
+        if frames >= 9 {
+            return;
+        }
+        // Where the machine has paused for longer it is played again.
+        assert!(begun.elapsed() > Duration::from_millis(1300), "{frames} of 12 frames are left");
+        assert!(Instant::now() < end, "{frames} of 12 frames are left of each attempt");
+    }
 }
 
 #[test]

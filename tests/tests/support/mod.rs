@@ -48,8 +48,16 @@ pub fn pictures(folder: &Path) -> usize {
 
 /// Waits until the condition holds; panics at the timeout.
 pub fn wait_until(what: &str, mut done: impl FnMut() -> bool) {
+    wait_for(what, || done().then_some(()));
+}
+
+/// Waits for a value, which may be gone again a moment later; panics at the timeout.
+pub fn wait_for<T>(what: &str, mut ready: impl FnMut() -> Option<T>) -> T {
     let deadline = Instant::now() + PATIENCE;
-    while !done() {
+    loop {
+        if let Some(value) = ready() {
+            return value;
+        }
         assert!(Instant::now() < deadline, "timed out waiting for {what}");
         std::thread::sleep(Duration::from_millis(50));
     }
@@ -61,8 +69,7 @@ pub const SMALL_SIM: &str = "width = 96\nheight = 96\ntexture_px = 128\n";
 /// Writes `rig.toml` and `sim.toml` of a small simulated rig with this name; returns the endpoint that it listens on. `more` is
 /// appended to `rig.toml`.
 pub fn small_rig(name: &str, folder: &Path, more: &str) -> String {
-    let port = std::net::TcpListener::bind("127.0.0.1:0").unwrap().local_addr().unwrap().port();
-    let endpoint = format!("tcp/127.0.0.1:{port}");
+    let endpoint = format!("tcp/127.0.0.1:{}", flyrig_tests::free_port());
     let config = format!(
         "[rig]\nname = \"{name}\"\n[source]\npath = \"sim.toml\"\ncameras = [\"00\", \"03\"]\n\
          [perception]\npose = \"given\"\nmasks = \"given\"\n\

@@ -1,7 +1,7 @@
 //! Tests of a gate in front of a session that echoes.
 
 use std::{
-    io::{Read as _, Write as _},
+    io::{ErrorKind, Read as _, Write as _},
     net::{SocketAddr, TcpListener, TcpStream},
     sync::Arc,
     thread::Builder,
@@ -90,6 +90,44 @@ fn echo(stream: &mut StreamOwned<ClientConnection, TcpStream>, text: &[u8]) -> V
     back
 }
 
+/// Asks again until it is so: the gate reads its list from time to time.
+fn until(what: &str, mut is_so: impl FnMut() -> bool) {
+    let end = Instant::now() + Duration::from_secs(90);
+    while !is_so() {
+        assert!(Instant::now() < end, "waited in vain for {what}");
+        std::thread::sleep(Duration::from_millis(50));
+    }
+}
+
+/// Knocks until the key is refused in these words, which are returned: on a busy machine an answer may be late.
+fn refused(key: &KeyFile, words: &str) -> String {
+    let mut text = String::new();
+    until(words, || {
+        text = key.knock().err().map_or_else(String::new, |error| error.to_string());
+        text.contains(words)
+    });
+    text
+}
+
+fn admitted(key: &KeyFile) {
+    until("the gate to admit a key", || key.knock().is_ok());
+}
+
+/// Waits until a connection ends on which nothing more comes; returns the time by the turns that this thread had. A machine that pauses or is
+/// busy has fewer of them.
+fn ended(stream: &mut StreamOwned<ClientConnection, TcpStream>) -> Duration {
+    let turn = Duration::from_millis(10);
+    stream.sock.set_read_timeout(Some(turn)).unwrap();
+    for turns in 0..9000 {
+        match stream.read(&mut [0; 9]) {
+            Ok(1..) => panic!("something more came"),
+            Err(error) if matches!(error.kind(), ErrorKind::WouldBlock | ErrorKind::TimedOut) => {}
+            _ => return turns * turn,
+        }
+    }
+    panic!("it does not end");
+}
+
 #[test]
 fn holders_are_passed_on_under_their_number() {
     let mut place = place();
@@ -102,14 +140,11 @@ fn holders_are_passed_on_under_their_number() {
 #[test]
 fn a_key_that_expires_is_refused_and_an_open_connection_ends() {
     let mut place = place();
-    let why = place.add_until("old", now_secs() - 10).knock().unwrap_err().to_string();
-    assert!(why.contains("refuses the key of 'old': it expired on "), "{why}");
+    refused(&place.add_until("old", now_secs() - 10), "refuses the key of 'old': it expired on ");
     // One that ends in the middle.
-    let mut stream = connect(&place.add_until("soon", now_secs() + 3));
+    let mut stream = connect(&place.add_until("soon", now_secs() + 8));
     echo(&mut stream, b"hello");
-    let begun = Instant::now();
-    assert!(!matches!(stream.read(&mut [0; 9]), Ok(1..)), "nothing more comes");
-    assert!(begun.elapsed() < Duration::from_secs(8));
+    assert!(ended(&mut stream) < Duration::from_secs(13));
 }
 
 #[test]
@@ -121,7 +156,7 @@ fn a_list_that_cannot_be_read_changes_nothing() {
     std::fs::write(place.ring.folder().join("ring.toml"), "half a li").unwrap();
     std::thread::sleep(2 * CHECK_EVERY);
     assert_eq!(echo(&mut stream, b"again"), b"vagain");
-    key.knock().unwrap();
+    admitted(&key);
 }
 
 /// As a gate without file descriptors finds it: the list is there, and cannot be opened for a while.
@@ -149,10 +184,9 @@ fn a_revocation_that_could_not_be_read_is_read_later_whatever_the_time_of_its_li
     std::fs::remove_dir(&list).unwrap();
     std::fs::File::options().write(true).open(&revoked).unwrap().set_modified(time).unwrap();
     std::fs::rename(&revoked, &list).unwrap();
-    let begun = Instant::now();
-    assert!(!matches!(stream.read(&mut [0; 9]), Ok(1..)), "nothing more comes");
-    assert!(begun.elapsed() < Duration::from_secs(2), "{:?}", begun.elapsed());
-    assert!(key.knock().unwrap_err().to_string().contains("it was revoked"));
+    let took = ended(&mut stream);
+    assert!(took < Duration::from_secs(2), "{took:?}");
+    refused(&key, "it was revoked");
 }
 
 #[test]
@@ -163,12 +197,11 @@ fn two_changes_within_the_resolution_of_file_times_are_both_seen() {
     place.ring.revoke("one").unwrap();
     let time = std::fs::metadata(&list).unwrap().modified().unwrap();
     std::thread::sleep(3 * CHECK_EVERY);
-    assert!(one.knock().is_err());
-    two.knock().unwrap();
+    refused(&one, "it was revoked");
+    admitted(&two);
     place.ring.revoke("two").unwrap();
     std::fs::File::options().write(true).open(&list).unwrap().set_modified(time).unwrap();
-    std::thread::sleep(3 * CHECK_EVERY);
-    assert!(two.knock().unwrap_err().to_string().contains("it was revoked"));
+    refused(&two, "it was revoked");
 }
 
 #[test]
@@ -184,17 +217,14 @@ fn revoked_and_expired_keys_are_refused_in_the_same_words_after_a_restart() {
     }
     place.ring.revoke("revoked").unwrap();
     assert!(place.ring.holders().iter().all(|of| of.name != "forgotten"));
-    std::thread::sleep(2 * CHECK_EVERY);
     let refusals = |address: SocketAddr| {
-        [&revoked, &forgotten, &expired].map(|key| {
+        let words = [(&revoked, "it was revoked"), (&forgotten, "it was revoked"), (&expired, "it expired on")];
+        words.map(|(key, words)| {
             let here = KeyFile { connect: vec![address.to_string()], ..key.clone() };
-            here.knock().unwrap_err().to_string().replace(&address.to_string(), "HERE")
+            refused(&here, words).replace(&address.to_string(), "HERE")
         })
     };
     let before = refusals(place.gate.address());
-    for (text, part) in before.iter().zip(["it was revoked", "it was revoked", "it expired on"]) {
-        assert!(text.contains(part), "{text}");
-    }
     let Place { _folder, ring, gate } = place;
     drop(gate);
     let inner = Inner::new().unwrap();
@@ -211,16 +241,15 @@ fn a_holder_may_send_its_own_cameras_at_any_time() {
     let a = place.ring.add_file(&file, "a", Role::Cameras, &["left".to_owned()], 1).unwrap();
     let all = place.ring.add("all", Role::Cameras, 1).unwrap();
     let viewer = place.ring.add("desk", Role::Viewer, 1).unwrap();
-    std::thread::sleep(2 * CHECK_EVERY);
     let holders = place.gate.holders();
+    until("the new holders", || holders.may_send(&a.topic_name, "left") && holders.may_send(&all.topic_name, "right"));
     assert!(holders.may_send(&a.topic_name, "left") && !holders.may_send(&a.topic_name, "right"));
     assert!(holders.may_send(&all.topic_name, "right"));
     for name in [viewer.topic_name.as_str(), "", "ffffffff-0", "*"] {
         assert!(!holders.may_send(name, "left"), "{name}");
     }
     place.ring.revoke("a").unwrap();
-    std::thread::sleep(2 * CHECK_EVERY);
-    assert!(!holders.may_send(&a.topic_name, "left"));
+    until("the revocation", || !holders.may_send(&a.topic_name, "left"));
 }
 
 #[test]
@@ -238,7 +267,7 @@ fn one_key_has_its_share_of_connections() {
     assert_eq!(echo(&mut connect(&other), b"x"), b"?x");
     drop(open);
     // Places are given back.
-    let end = Instant::now() + Duration::from_secs(20);
+    let end = Instant::now() + Duration::from_secs(90);
     loop {
         let mut stream = connect(&key);
         if stream.write_all(b"x").is_ok() && matches!(stream.read(&mut [0; 9]), Ok(1..)) {

@@ -16,9 +16,9 @@ pub(crate) fn loopback_session() -> Session {
     session
 }
 
-/// Waits until a condition holds; panics after 20 s.
+/// Waits until a condition holds; panics after 90 s.
 pub(crate) fn wait_until(what: &str, is_true: impl Fn() -> bool) {
-    let deadline = Instant::now() + Duration::from_secs(20);
+    let deadline = Instant::now() + Duration::from_secs(90);
     while !is_true() {
         assert!(Instant::now() < deadline, "{what} did not happen");
         std::thread::sleep(Duration::from_millis(10));

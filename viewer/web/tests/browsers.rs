@@ -2,7 +2,7 @@
 #![allow(clippy::unwrap_used, clippy::panic)] // a test may fail by panicking, in its helpers too
 
 use std::{
-    io::{Read as _, Write as _},
+    io::{ErrorKind, Read as _, Write as _},
     net::{SocketAddr, TcpStream},
     sync::{
         Arc,
@@ -38,7 +38,15 @@ struct TestRig {
 impl TestRig {
     fn start(listen: &str, x: f32) -> Self {
         let config = TransportConfig { listen: vec![listen.to_owned()], ..TransportConfig::publisher(NAME) };
-        let publisher = Publisher::open(&config).unwrap();
+        // The port of the rig before may be free a moment later.
+        let started = Instant::now();
+        let publisher = loop {
+            match Publisher::open(&config) {
+                Ok(publisher) => break publisher,
+                Err(error) => assert!(started.elapsed() < PATIENCE, "{error}"),
+            }
+            std::thread::sleep(Duration::from_millis(20));
+        };
         publisher.set_calibration(&cameras()).unwrap();
         let endpoint = publisher.endpoints()[0].clone();
         let stop = Arc::<AtomicBool>::default();
@@ -160,7 +168,9 @@ fn ask(address: SocketAddr, request: &str) -> String {
 
 #[test]
 fn browsers_see_a_rig_that_comes_late_goes_and_comes_again_as_another() {
-    let port = std::net::TcpListener::bind("127.0.0.1:0").unwrap().local_addr().unwrap().port();
+    // The system gives those from 32768 on to whoever asks for any port, and to the server's attempts to connect.
+    let mut ports = (0..12_000).map(|n| 20_000 + ((std::process::id() + n) % 12_000) as u16);
+    let port = ports.find(|port| std::net::TcpListener::bind(("127.0.0.1", *port)).is_ok()).unwrap();
     let endpoint = format!("tcp/127.0.0.1:{port}");
     let server = server(&endpoint, "127.0.0.1:0", false);
     let (mut socket, mut page) = (browser(server.address(), ""), Page::default());
@@ -194,11 +204,11 @@ fn a_browser_that_stops_reading_delays_no_other() {
     let _stopped = [browser(server.address(), ""), browser(server.address(), "")];
     let mut socket = browser(server.address(), "");
     let (started, mut motions) = (Instant::now(), 0);
-    while started.elapsed() < Duration::from_secs(3) || motions == 0 {
+    // Three seconds give ninety, where the machine is not busy.
+    while started.elapsed() < Duration::from_secs(3) || motions <= 20 {
         motions += u32::from(next(&mut socket).0 == 2);
-        assert!(started.elapsed() < PATIENCE);
+        assert!(started.elapsed() < PATIENCE, "{motions} motions");
     }
-    assert!(motions > 20, "{motions} motions in three seconds");
     // Three may watch.
     let mut fourth = browser(server.address(), "");
     let closed = loop {
@@ -362,12 +372,26 @@ fn half_open_connections_and_floods_delay_no_other() {
     assert!(ended);
 }
 
-/// Asks for the page and returns how long the answer took.
+/// Asks for the page and returns how long the answer took, by the turns that this thread had: a machine that pauses or is busy has fewer of
+/// them.
 fn page_time(address: SocketAddr) -> Duration {
-    let started = Instant::now();
-    let answer = ask(address, "GET / HTTP/1.1\r\nHost: localhost\r\n\r\n");
-    assert!(answer.starts_with("HTTP/1.1 200"), "{answer}");
-    started.elapsed()
+    let turn = Duration::from_millis(5);
+    let begun = Instant::now();
+    let mut stream = TcpStream::connect(address).unwrap();
+    let connecting = begun.elapsed();
+    stream.set_read_timeout(Some(turn)).unwrap();
+    stream.write_all(b"GET / HTTP/1.1\r\nHost: localhost\r\n\r\n").unwrap();
+    let (mut answer, mut turns) = (Vec::new(), 0);
+    while turns * turn < PATIENCE {
+        let mut bytes = [0; 4096];
+        match stream.read(&mut bytes) {
+            Ok(count @ 1..) => answer.extend_from_slice(&bytes[..count]),
+            Err(error) if matches!(error.kind(), ErrorKind::WouldBlock | ErrorKind::TimedOut) => turns += 1,
+            _ => break,
+        }
+    }
+    assert!(answer.starts_with(b"HTTP/1.1 200"), "{}", String::from_utf8_lossy(&answer));
+    connecting + turns * turn
 }
 
 /// Opens connections on which a request is sent, and little or nothing read.
@@ -401,7 +425,8 @@ fn an_answer_that_is_not_read_ends() {
     let server = server("tcp/127.0.0.1:1", "127.0.0.1:0", false);
     let mut deaf = TcpStream::connect(server.address()).unwrap();
     deaf.write_all(b"GET /page.wasm HTTP/1.1\r\nHost: localhost\r\n\r\n").unwrap();
-    std::thread::sleep(Duration::from_secs(13));
+    // Much longer than the server waits: it may be late on a busy machine.
+    std::thread::sleep(Duration::from_secs(20));
     let mut answer = Vec::new();
     let _ = deaf.read_to_end(&mut answer);
     assert!(answer.starts_with(b"HTTP/1.1 200") && answer.len() < 200_000, "{} bytes", answer.len());
@@ -414,6 +439,7 @@ fn sockets_without_a_token_are_bounded_and_delay_no_other() {
     let mut watching = browser(address, "");
     let upgrade = "GET /stream HTTP/1.1\r\nHost: localhost\r\nUpgrade: websocket\r\nConnection: Upgrade\r\n\
                    Sec-WebSocket-Version: 13\r\nSec-WebSocket-Key: AAAAAAAAAAAAAAAAAAAAAA==\r\n\r\n";
+    let begun = Instant::now();
     let mut silent = requests(address, 900, upgrade);
     assert!(silent.len() > 800, "{}: raise the limit of open files", silent.len());
     assert!(page_time(address) < Duration::from_secs(1));
@@ -421,17 +447,18 @@ fn sockets_without_a_token_are_bounded_and_delay_no_other() {
         match stream.read(&mut [0; 512]) {
             Ok(0) => break false,
             Ok(_) => {}
-            Err(error) => break error.kind() == std::io::ErrorKind::WouldBlock,
+            Err(error) => break error.kind() == ErrorKind::WouldBlock,
         }
     };
     let open = silent.iter_mut().filter_map(|stream| is_open(stream).then_some(())).count();
-    assert!(open > 0 && open < 512, "{open}");
+    // After five seconds they end by themselves.
+    assert!((open > 0 || begun.elapsed() > Duration::from_secs(5)) && open < 512, "{open}");
     // One that has shown its token stays, and another is let in.
     watching.send(Message::Ping(Default::default())).unwrap();
     assert!(std::iter::repeat_with(|| watching.read().unwrap()).take(1000).any(|message| message.is_pong()));
     next(&mut browser(address, ""));
     // Without a token they end by themselves.
-    let deadline = Instant::now() + Duration::from_secs(20);
+    let deadline = Instant::now() + PATIENCE;
     while silent.iter_mut().any(is_open) {
         assert!(Instant::now() < deadline, "sockets without a token stay open");
         std::thread::sleep(Duration::from_millis(100));

@@ -73,21 +73,30 @@ fn a_frame_comes_out_as_it_went_in_with_the_time_of_this_computer() {
     let (left, right) = (CameraId::from("left"), CameraId::from("right"));
     let mut sequence = 0;
     publish_until_seen(&host, &there, "left", &mut sequence);
-    for n in 100..110 {
-        let sent = frame("left", n);
-        let wanted = (sent.sequence, sent.exposure_nanos, sent.image.format(), sent.image.bytes().to_vec());
-        let taken = sent.capture_nanos - 3_600_000_000_000;
-        assert_ne!(host.publish(sent).unwrap(), PublishOutcome::Unwatched);
+    // Frames from 100 on, and when they were taken.
+    let mut taken = Vec::new();
+    for _ in 0..10 {
+        let round_trip = || there.link(&left).clock.unwrap().round_trip_nanos;
+        let before = round_trip();
+        // Another one until one is there: on a busy machine zenoh may drop one, or an earlier one comes.
         let found = wait_for("the frame", || {
+            let sent = frame("left", 100 + taken.len() as u64);
+            taken.push(sent.capture_nanos - 3_600_000_000_000);
+            assert_ne!(host.publish(sent).unwrap(), PublishOutcome::Unwatched);
             there.next_frame(&left, Duration::from_millis(100)).unwrap().filter(|frame| frame.sequence >= 100)
         });
-        assert_eq!((found.sequence, found.exposure_nanos, found.image.format(), found.image.bytes().to_vec()), wanted);
-        let round_trip = there.link(&left).clock.unwrap().round_trip_nanos;
-        let error = (found.capture_nanos - taken).abs();
+        let wanted = frame("left", found.sequence);
+        assert_eq!((found.exposure_nanos, found.image.format()), (wanted.exposure_nanos, wanted.image.format()));
+        assert_eq!(found.image.bytes(), wanted.image.bytes());
+        // The clock may have been asked again since the frame came.
+        let round_trip = before.max(round_trip());
+        let error = (found.capture_nanos - taken[found.sequence as usize - 100]).abs();
         assert!(error <= round_trip / 2 + 1_000_000, "{error} ns of a round trip of {round_trip} ns");
     }
     assert!(there.next_frame(&right, Duration::ZERO).unwrap().is_none());
-    assert!(there.absence(&right).contains("no computer of rig 'test' sends a camera of this name"));
+    wait_until("the word that it is not sent", || {
+        there.absence(&right).contains("no computer of rig 'test' sends a camera of this name")
+    });
     let status = CameraStatus { host: "pi-2".into(), problem: "was unplugged".into(), ..CameraStatus::default() };
     wait_until("the status", || {
         host.publish_status(&right, &status).unwrap();
@@ -108,6 +117,7 @@ fn a_reader_that_sleeps_gets_the_newest_and_every_loss_has_its_cause() {
     let a = CameraId::from("a");
     let mut sequence = 0;
     publish_until_seen(&host, &there, "a", &mut sequence);
+    wait_until_settled("the frames until then", || there.link(&a).frames);
     let before = (there.link(&a), host.counts()[0].1);
     let mut last = 0;
     for n in 1000..1200 {
@@ -121,16 +131,17 @@ fn a_reader_that_sleeps_gets_the_newest_and_every_loss_has_its_cause() {
     let settled = || {
         let link = there.link(&a);
         let gone = link.frames - before.0.frames + link.withheld - before.0.withheld + link.lost - before.0.lost;
-        (gone >= 200).then_some((link, gone))
+        let has_come = gone >= 200 && gone >= host.counts()[0].1.offered - before.1.offered;
+        (has_come && link.overtaken > before.0.overtaken).then_some((link, gone))
     };
     let (link, gone) = wait_for("the last frame", || {
         settled().or_else(|| {
             last += 1;
             host.publish(frame("a", last)).unwrap();
+            std::thread::sleep(Duration::from_millis(20));
             None
         })
     });
-    assert!(link.overtaken > before.0.overtaken, "{link:?}");
     let sent = host.counts()[0].1;
     assert!(gone <= sent.offered - before.1.offered, "{gone} of {sent:?}");
     assert_eq!(link.withheld - before.0.withheld, sent.replaced - before.1.replaced, "{sent:?}");
@@ -152,10 +163,15 @@ fn a_computer_that_vanishes_and_returns_goes_on() {
     publish_until_seen(&first, &there, "a", &mut sequence);
     drop(first);
     wait_until("the report that it has left", || there.absence(&a).contains("its computer has left the network"));
-    let second = host("test", &["a"], &endpoint);
-    // As a restarted program does, it counts from the beginning.
-    let found = publish_until_seen(&second, &there, "a", &mut 0);
-    assert!(found.sequence < sequence.max(1000));
+    let config = TransportConfig { listen: vec![endpoint], ..TransportConfig::publisher("test") };
+    let second = wait_for("the port", || CameraPublisher::open(&config, std::slice::from_ref(&a), host_clock()).ok());
+    // As a restarted program does, it counts from the beginning. Frames of the first one may still wait.
+    let mut restarted = 0;
+    wait_until("a frame of the second", || {
+        let found = publish_until_seen(&second, &there, "a", &mut restarted);
+        assert!(found.sequence < sequence.max(1000));
+        there.link(&a).restarts > 0
+    });
     let link = there.link(&a);
     assert_eq!((link.restarts, link.refused), (1, 0), "{link:?}");
 }
@@ -260,23 +276,34 @@ fn hostile_messages_are_refused_and_the_camera_goes_on() {
         stranger.put(key, payload).attachment(attachment).wait().unwrap();
     };
     let before = there.link(&a).refused;
-    for n in 0..300u64 {
-        let mut attachment = good_header(n).encode().to_vec();
-        let mut payload = vec![0; 8];
-        match n % 7 {
-            0 => attachment.truncate(random.index(88)),
-            1 => attachment = random_bytes(&mut random, 88),
-            2 => attachment[random.index(HEADER_BYTES)] ^= 1 << random.index(8),
-            3 => payload.truncate(random.index(8)),
-            4 => attachment[HEADER_BYTES + 16] = random.next_u64() as u8,
-            5 => attachment[56..64].copy_from_slice(&[0xff; 8]),
-            // Of an age that cannot be.
-            _ => attachment[24..32].copy_from_slice(&i64::MAX.to_le_bytes()),
+    let mut flood = || {
+        for n in 0..300u64 {
+            let mut attachment = good_header(n).encode().to_vec();
+            let mut payload = vec![0; 8];
+            match n % 7 {
+                0 => attachment.truncate(random.index(88)),
+                1 => attachment = random_bytes(&mut random, 88),
+                2 => attachment[random.index(HEADER_BYTES)] ^= 1 << random.index(8),
+                3 => payload.truncate(random.index(8)),
+                4 => attachment[HEADER_BYTES + 16] = random.next_u64() as u8,
+                5 => attachment[56..64].copy_from_slice(&[0xff; 8]),
+                // Of an age that cannot be.
+                _ => attachment[24..32].copy_from_slice(&i64::MAX.to_le_bytes()),
+            }
+            put("flyrig/v1/test/camera/a", payload, attachment);
+            put("flyrig/v1/test/camera-status/a", random_bytes(&mut random, 50), vec![]);
         }
-        put("flyrig/v1/test/camera/a", payload, attachment);
-        put("flyrig/v1/test/camera-status/a", random_bytes(&mut random, 50), vec![]);
-    }
-    wait_until("the refusals", || there.link(&a).refused > before + 100);
+    };
+    flood();
+    wait_until("the refusals", || {
+        std::thread::sleep(Duration::from_millis(100));
+        let refused = there.link(&a).refused;
+        // On a busy machine zenoh may drop most of them.
+        if refused <= before + 100 {
+            flood();
+        }
+        refused > before + 100
+    });
     let mut reported = 0;
     let found = wait_for("a good frame", || {
         sequence += 1;
@@ -359,6 +386,7 @@ fn the_camera_of_huge_images_loses_its_own_where_bytes_are_short() {
         std::thread::sleep(Duration::from_millis(2));
         there.link(&huge).frames >= 6 && there.link(&small).frames >= 6
     });
+    wait_until_settled("the last of them", || [&huge, &small].map(|camera| there.link(camera).frames));
     let drain = |camera: &CameraId| {
         std::iter::from_fn(|| there.next_frame(camera, Duration::ZERO).unwrap())
             .map(|f| f.image.bytes().len())

@@ -104,9 +104,9 @@ fn a_killed_watcher_is_forgotten_and_costs_no_other_a_frame() {
     let mut frame = 0;
     wait_until("the watcher's first frame and viewpoint", || {
         publish(&publisher, &mut frame);
-        watcher.newest() > 0 && publisher.requested_viewpoints().len() == 1
+        let is_known = publisher.requested_viewpoints().len() == 1 && publisher.has_splat_subscribers();
+        watcher.newest() > 0 && is_known
     });
-    assert!(publisher.has_splat_subscribers());
     watcher.child.kill().unwrap();
     wait_until("the watcher to be forgotten", || {
         publish(&publisher, &mut frame);
@@ -134,18 +134,24 @@ fn a_paused_watcher_slows_no_other_and_catches_up_with_the_newest_frame() {
 
     // Far more than all the buffers on the way hold: a publisher that waited for the watcher would stand still.
     let mut healthy_frames = 0;
-    for _ in 0..600 {
-        publish(&publisher, &mut frame);
-        healthy_frames += u32::from(healthy.next_view(Duration::from_millis(2)).unwrap().is_some());
-    }
+    let mut turns = 0;
+    wait_until("six hundred frames, and some at the healthy one", || {
+        for _ in 0..100 {
+            publish(&publisher, &mut frame);
+            healthy_frames += u32::from(healthy.next_view(Duration::from_millis(2)).unwrap().is_some());
+        }
+        turns += 100;
+        turns >= 600 && healthy_frames > 0
+    });
     let counts = || publisher.counts().into_iter().find(|(label, _)| label == "view/front").unwrap().1;
     wait_until("the slot to drain", || counts().offered == counts().sent + counts().replaced + counts().unwatched);
     assert_eq!((counts().offered, counts().failed), (frame, 0));
     wait_until("the newest frame at the healthy one", || {
         publish(&publisher, &mut frame);
-        healthy.next_view(Duration::from_millis(50)).unwrap().is_some_and(|received| received.header.frame == frame)
+        // On a busy machine earlier ones are still on their way.
+        let mut came = std::iter::from_fn(|| healthy.next_view(Duration::from_millis(50)).unwrap());
+        came.any(|received| received.header.frame == frame)
     });
-    assert!(healthy_frames > 0);
     wait_until("the end of its lease", || publisher.requested_viewpoints().is_empty());
 
     // Paused for longer than zenoh keeps a silent session: the splats, which it alone watched, are skipped.

@@ -2,6 +2,7 @@
 
 use std::{
     net::TcpListener,
+    sync::atomic::{AtomicU32, Ordering},
     time::{Duration, Instant},
 };
 
@@ -13,7 +14,10 @@ use flyrig_types::{Camera, Intrinsics, Isometry, Lens, Rig};
 use glam::{DVec2, DVec3};
 
 /// No wait of a test is longer.
-pub const PATIENCE: Duration = Duration::from_secs(40);
+pub const PATIENCE: Duration = Duration::from_secs(90);
+
+/// Time between two looks.
+pub const TURN: Duration = Duration::from_millis(5);
 
 /// Asks again until `ready` says something.
 pub fn wait_for<T>(what: &str, mut ready: impl FnMut() -> Option<T>) -> T {
@@ -23,7 +27,7 @@ pub fn wait_for<T>(what: &str, mut ready: impl FnMut() -> Option<T>) -> T {
             return value;
         }
         assert!(Instant::now() < end, "waited in vain for {what}");
-        std::thread::sleep(Duration::from_millis(5));
+        std::thread::sleep(TURN);
     }
 }
 
@@ -31,15 +35,47 @@ pub fn wait_until(what: &str, mut ready: impl FnMut() -> bool) {
     wait_for(what, || ready().then_some(()));
 }
 
+/// Waits as [`wait_until`]; returns the time by the turns that this thread had. A machine that pauses or is busy has fewer of them.
+pub fn turns_until(what: &str, mut ready: impl FnMut() -> bool) -> Duration {
+    let mut turns = 0;
+    wait_until(what, || {
+        turns += 1;
+        ready()
+    });
+    turns * TURN
+}
+
+/// Waits until what is counted has been the same at forty looks: nothing is on its way any more.
+pub fn wait_until_settled<T: PartialEq>(what: &str, mut count: impl FnMut() -> T) {
+    let (mut last, mut looks) = (count(), 0);
+    wait_until(what, || {
+        let now = count();
+        looks = if now == last { looks + 1 } else { 0 };
+        last = now;
+        looks >= 40
+    });
+}
+
+/// Returns a port that is free, as is its successor, and that no other test gets. The system gives those from 32768 on to whoever asks for any.
+pub fn free_port() -> u16 {
+    static NEXT: AtomicU32 = AtomicU32::new(0);
+    wait_for("two free ports", || {
+        // Tests of other processes begin at other ports.
+        let turn = std::process::id().wrapping_mul(97).wrapping_add(NEXT.fetch_add(1, Ordering::Relaxed));
+        let port = (20_000 + 2 * (turn % 6000)) as u16;
+        [port, port + 1].iter().all(|port| TcpListener::bind(("0.0.0.0", *port)).is_ok()).then_some(port)
+    })
+}
+
 pub fn free_endpoint() -> String {
-    let port = TcpListener::bind("127.0.0.1:0").unwrap().local_addr().unwrap().port();
-    format!("tcp/127.0.0.1:{port}")
+    format!("tcp/127.0.0.1:{}", free_port())
 }
 
 pub fn open_publisher(change: impl FnOnce(&mut TransportConfig)) -> Publisher {
     let mut config = TransportConfig { listen: vec!["tcp/127.0.0.1:0".into()], ..TransportConfig::publisher("test") };
     change(&mut config);
-    Publisher::open(&config).unwrap()
+    // The port of one that was closed may be free a moment later.
+    wait_for("a publisher", || Publisher::open(&config).inspect_err(|error| println!("{error}")).ok())
 }
 
 pub fn subscriber_config(endpoints: &[String]) -> TransportConfig {
