@@ -48,6 +48,7 @@ pub use masks::gate::BodyGate;
 pub use masks::key_color::{KeyColor, KeyColorError};
 pub use masks::matte::matte;
 pub use masks::person_area::PersonArea;
+pub use masks::seen_background::SeenBackground;
 pub use network::pose_net::PoseNet;
 pub use pose::config::PoseConfig;
 pub use pose::estimate::{NoMask, PoseEstimate, PoseQuality, StageSeconds, ViewQuality};

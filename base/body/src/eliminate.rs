@@ -1,7 +1,6 @@
 //! Even spacing by removal of points: weighted sample elimination (C. Yuksel, "Sample Elimination for
 //! Generating Poisson Disk Sample Sets", Computer Graphics Forum 34(2), 2015).
 
-use std::cmp::Ordering;
 use std::collections::BinaryHeap;
 use std::collections::binary_heap::PeekMut;
 
@@ -42,16 +41,16 @@ pub(crate) fn eliminate(points: &[Vec3], normals: &[Vec3], keep: usize, area: f6
         })
         .collect();
     let mut weights: Vec<f32> = neighbors.iter().map(|list| list.iter().map(|(_, w)| w).sum()).collect();
-    let mut heap: BinaryHeap<Entry> =
-        weights.iter().enumerate().map(|(index, &weight)| Entry { weight, index }).collect();
+    let mut heap: BinaryHeap<u64> = weights.iter().enumerate().map(|(index, weight)| entry(*weight, index)).collect();
     let mut alive = vec![true; points.len()];
     let mut left = points.len();
     while left > keep {
         let Some(mut highest) = heap.peek_mut() else { break };
-        let index = highest.index;
+        let index = (u32::MAX - *highest as u32) as usize;
         // Weights only fall: an outdated entry is too high and sinks to its place.
-        if highest.weight > weights[index] {
-            highest.weight = weights[index];
+        let now = entry(weights[index], index);
+        if *highest > now {
+            *highest = now;
             continue;
         }
         PeekMut::pop(highest);
@@ -64,27 +63,10 @@ pub(crate) fn eliminate(points: &[Vec3], normals: &[Vec3], keep: usize, area: f6
     (0..points.len()).filter(|&i| alive[i]).collect()
 }
 
-struct Entry {
-    weight: f32,
-    index: usize,
+/// Returns the entry of a point in the heap, the highest first: its weight, then the lower index. One number is compared
+/// and moved in a fraction of the time of two.
+fn entry(weight: f32, index: usize) -> u64 {
+    let bits = weight.to_bits();
+    let ordered = if bits >> 31 == 0 { bits | 1 << 31 } else { !bits };
+    u64::from(ordered) << 32 | u64::from(u32::MAX - index as u32)
 }
-
-impl Ord for Entry {
-    fn cmp(&self, other: &Self) -> Ordering {
-        self.weight.total_cmp(&other.weight).then(other.index.cmp(&self.index))
-    }
-}
-
-impl PartialOrd for Entry {
-    fn partial_cmp(&self, other: &Self) -> Option<Ordering> {
-        Some(self.cmp(other))
-    }
-}
-
-impl PartialEq for Entry {
-    fn eq(&self, other: &Self) -> bool {
-        self.cmp(other) == Ordering::Equal
-    }
-}
-
-impl Eq for Entry {}

@@ -73,10 +73,13 @@ impl Lens {
             let theta = r.atan();
             return ideal * (theta * polynomial(&series(coefficients), theta * theta) / r);
         }
-        let (k, [p1, p2]) = self.rational().unwrap_or_default();
         let (x, y) = (ideal.x, ideal.y);
         let r2 = ideal.length_squared();
-        let radial = polynomial(&series(&k[..3]), r2) / polynomial(&series(&k[3..]), r2);
+        let (k, [p1, p2]) = self.rational().unwrap_or_default();
+        let radial = match self {
+            Self::Rational { .. } => polynomial(&series(&k[..3]), r2) / polynomial(&series(&k[3..]), r2),
+            _ => 1.0 + r2 * (k[0] + r2 * (k[1] + r2 * k[2])),
+        };
         DVec2::new(
             x * radial + 2.0 * p1 * x * y + p2 * (r2 + 2.0 * x * x),
             y * radial + p1 * (r2 + 2.0 * y * y) + 2.0 * p2 * x * y,
@@ -124,6 +127,10 @@ impl Lens {
     /// alone each condition falls with the radius; where it is positive, it is positive at all smaller radii.
     fn surely_grows(&self, radius: f64) -> bool {
         let s = self.squared_argument(radius);
+        // The common lens without the polynomials in full: this runs for each projected point.
+        if let Self::RadialTangential { radial: [k1, k2, k3], .. } = *self {
+            return 1.0 + s * ((3.0 * k1).min(0.0) + s * ((5.0 * k2).min(0.0) + s * (7.0 * k3).min(0.0))) > 0.0;
+        }
         self.conditions().iter().all(|condition| {
             let negative: [f64; 7] = std::array::from_fn(|i| if i == 0 { condition[0] } else { condition[i].min(0.0) });
             polynomial(&negative, s) > 0.0

@@ -29,47 +29,8 @@ impl Grid {
     /// Sets the pixels whose centre lies in one of the triangles, and the pixels of their corners, to 1. Triangles with an
     /// unplaced vertex are ignored. Places are pixels, centres at integers.
     pub fn fill_mesh(&mut self, places: &[Option<DVec2>], triangles: &[[u32; 3]]) {
-        let place = |vertex: u32| places.get(vertex as usize).copied().flatten();
-        let placed = triangles.iter().filter_map(|&[a, b, c]| Some([place(a)?, place(b)?, place(c)?]));
-        self.fill_triangles(&placed.collect::<Vec<_>>());
-    }
-
-    fn fill_triangles(&mut self, triangles: &[[DVec2; 3]]) {
-        triangles.iter().for_each(|&[a, b, c]| self.fill_triangle(a, b, c));
-    }
-
-    /// Sets the pixels whose centre lies in a triangle, and the pixels of its corners, to 1.
-    fn fill_triangle(&mut self, a: DVec2, b: DVec2, c: DVec2) {
-        let low = a.min(b).min(c);
-        let high = a.max(b).max(c);
-        // Ignores triangles that are not finite, too.
-        if !(high.y >= 0.0 && low.y < self.height as f64) {
-            return;
-        }
-        for corner in [a, b, c] {
-            if corner.x >= 0.0 && corner.y >= 0.0 {
-                let (x, y) = (corner.x as usize, corner.y as usize);
-                if x < self.width && y < self.height {
-                    self.values[y * self.width + x] = 1.0;
-                }
-            }
-        }
-        let clamp = |v: f64, end: usize| v.clamp(0.0, end as f64) as usize;
-        let columns = clamp(low.x.ceil(), self.width)..clamp(high.x.floor() + 1.0, self.width);
-        let rows = clamp(low.y.ceil(), self.height)..clamp(high.y.floor() + 1.0, self.height);
-        // Most triangles of a body lie between the centres of pixels.
-        if columns.is_empty() || rows.is_empty() {
-            return;
-        }
-        let turned = if (b - a).perp_dot(c - a) < 0.0 { -1.0 } else { 1.0 };
-        let sides = [(a, (b - a) * turned), (b, (c - b) * turned), (c, (a - c) * turned)];
-        for y in rows {
-            let from = sides.map(|(from, side)| side.x * (y as f64 - from.y) + side.y * from.x);
-            let inside = |x: usize| (0..3).all(|k| from[k] - sides[k].1.y * x as f64 >= 0.0);
-            let Some(first) = columns.clone().find(|x| inside(*x)) else { continue };
-            for x in (first..columns.end).take_while(|x| inside(*x)) {
-                self.values[y * self.width + x] = 1.0;
-            }
+        if !self.values.is_empty() {
+            pulp::Arch::new().dispatch(FillMesh { grid: self, places, triangles });
         }
     }
 
@@ -119,6 +80,55 @@ impl Grid {
             }
         }
         Mask::new(width as u32, height as u32, coverage).ok()
+    }
+}
+
+/// [`Grid::fill_mesh`] of a grid with pixels, compiled for the processor's vector instructions.
+struct FillMesh<'a> {
+    grid: &'a mut Grid,
+    places: &'a [Option<DVec2>],
+    triangles: &'a [[u32; 3]],
+}
+
+impl pulp::NullaryFnOnce for FillMesh<'_> {
+    type Output = ();
+
+    #[inline(always)]
+    fn call(self) {
+        let Self { grid: Grid { width, height, values }, places, triangles } = self;
+        let (width, height) = (*width, *height);
+        let end = DVec2::new(width as f64, height as f64);
+        let place = |vertex: u32| places.get(vertex as usize).copied().flatten();
+        for &[a, b, c] in triangles {
+            let (Some(a), Some(b), Some(c)) = (place(a), place(b), place(c)) else { continue };
+            let (low, high) = (a.min(b).min(c), a.max(b).max(c));
+            // Ignores triangles that are not finite, too.
+            if !(high.x >= 0.0 && high.y >= 0.0 && low.x < end.x && low.y < end.y) {
+                continue;
+            }
+            for corner in [a, b, c] {
+                if corner.x >= 0.0 && corner.y >= 0.0 && corner.x < end.x && corner.y < end.y {
+                    values[corner.y as usize * width + corner.x as usize] = 1.0;
+                }
+            }
+            let (first, last) = (low.ceil().max(DVec2::ZERO), (high.floor() + 1.0).min(end));
+            let (columns, rows) = (first.x as usize..last.x as usize, first.y as usize..last.y as usize);
+            // Most triangles of a body lie between the centres of pixels, or behind others that are filled.
+            let is_full = |y: usize| values[y * width..][columns.clone()].iter().all(|value| *value == 1.0);
+            if columns.is_empty() || rows.clone().all(is_full) {
+                continue;
+            }
+            let turned = if (b - a).perp_dot(c - a) < 0.0 { -1.0 } else { 1.0 };
+            let sides = [(a, (b - a) * turned), (b, (c - b) * turned), (c, (a - c) * turned)];
+            for y in rows {
+                let from = sides.map(|(from, side)| side.x * (y as f64 - from.y) + side.y * from.x);
+                let inside = |x: usize| (0..3).all(|k| from[k] - sides[k].1.y * x as f64 >= 0.0);
+                let Some(first) = columns.clone().find(|x| inside(*x)) else { continue };
+                for x in (first..columns.end).take_while(|x| inside(*x)) {
+                    values[y * width + x] = 1.0;
+                }
+            }
+        }
     }
 }
 
@@ -382,15 +392,19 @@ mod tests {
         assert_eq!(grid, square(60, 60, 5..45, 5..45));
     }
 
+    fn fill(grid: &mut Grid, corners: [DVec2; 3]) {
+        grid.fill_mesh(&corners.map(Some), &[[0, 1, 2]]);
+    }
+
     #[test]
     fn a_triangle_and_the_distance_to_it() {
         let mut grid = Grid::new(20, 20, 0.0);
-        grid.fill_triangles(&[[DVec2::new(2.0, 2.0), DVec2::new(12.0, 2.0), DVec2::new(2.0, 12.0)]]);
+        fill(&mut grid, [DVec2::new(2.0, 2.0), DVec2::new(12.0, 2.0), DVec2::new(2.0, 12.0)]);
         assert!(grid.values[4 * 20 + 4] > 0.5 && grid.values[11 * 20 + 11] < 0.5);
         let distance = grid.distance_to_set();
         assert!((distance.values[2 * 20 + 17] - 5.0).abs() < 0.1);
         // Nothing set: far, not infinite. Corners outside do not matter.
-        grid.fill_triangles(&[[DVec2::splat(-50.0), DVec2::new(1e9, 3.0), DVec2::NAN]]);
+        fill(&mut grid, [DVec2::splat(-50.0), DVec2::new(1e9, 3.0), DVec2::NAN]);
         assert!(Grid::new(3, 3, 0.0).distance_to_set().values.iter().all(|d| d.is_finite()));
     }
 

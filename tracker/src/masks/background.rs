@@ -5,17 +5,20 @@
 //! image ([`BackgroundLight`]). The owner ingests every fourth frame set, and every one while the background is being
 //! learnt.
 
+use std::sync::Arc;
+
 use flyrig_types::{Camera, Image, Mask};
 
 use crate::error::{TrackError, TrackErrorKind};
 use crate::image::pixels::Rgb;
 use crate::masks::background_event::BackgroundEvent;
-use crate::masks::background_light::BackgroundLight;
+use crate::masks::background_light::{BackgroundLight, Exposure};
 use crate::masks::gate::BodyGate;
 use crate::masks::gated_mask::gated_mask;
 use crate::masks::key_color::KeyColor;
 use crate::masks::person_area::PersonArea;
 use crate::masks::plate::Plate;
+use crate::masks::seen_background::SeenBackground;
 
 /// Background of one camera, as far as it is known.
 ///
@@ -134,9 +137,8 @@ impl Background {
     /// Kind `Image` when the format cannot be read.
     pub fn mask(&self, image: &Image, gate: &BodyGate) -> Result<Option<Mask>, TrackError> {
         let picture = Rgb::new(image)?;
-        let light = self.light(&picture, &|at| !gate.reaches_pixel(at));
-        let evidence = light.and_then(|light| light.evidence(&picture, gate.bounds));
-        Ok(evidence.and_then(|evidence| gated_mask(&evidence, gate)))
+        let seen = self.seen(&picture, gate);
+        Ok(seen.as_ref().and_then(SeenBackground::evidence).and_then(|evidence| gated_mask(evidence, gate)))
     }
 
     /// Ingests an image that shows no person but `people`: the background follows slow changes of the light and is relearnt
@@ -165,16 +167,36 @@ impl Background {
             return None;
         }
         match &self.kind {
-            Kind::Key(key) => key.screen(picture).map(|screen| BackgroundLight::Screen(key, screen)),
+            Kind::Key(key) => key.screen(picture).map(|screen| BackgroundLight::Screen(key, Arc::new(screen))),
             Kind::Plate(plate) => Some(BackgroundLight::Plate(plate, plate.drift(picture, is_background))),
         }
     }
 
-    /// Returns the colour of the screen, where the background is one.
-    pub(crate) fn key(&self) -> Option<&KeyColor> {
-        match &self.kind {
-            Kind::Key(key) => Some(key),
-            Kind::Plate(_) => None,
+    /// Measures the background around a posed body; `None` for an image of another size or without the screen.
+    pub(crate) fn seen(&self, picture: &Rgb, gate: &BodyGate) -> Option<SeenBackground> {
+        let light = self.light(picture, &|at| !gate.reaches_pixel(at))?;
+        Some(SeenBackground::new(&light, picture, gate))
+    }
+
+    /// Returns the share of `bounds` where the background is known, 0..=1.
+    pub(crate) fn known_share(&self, width: usize, [x0, y0, x1, y1]: [usize; 4]) -> f64 {
+        let Kind::Plate(plate) = &self.kind else { return 1.0 };
+        let known = (y0..y1).map(|y| (x0..x1).filter(|x| plate.knows(y * width + x)).count()).sum::<usize>();
+        known as f64 / ((x1 - x0) * (y1 - y0)).max(1) as f64
+    }
+
+    /// Returns the background in an exposure that was measured before; `None` for an image of another size, or an exposure of
+    /// another kind of background.
+    pub(crate) fn light_again(&self, picture: &Rgb, seen: &SeenBackground) -> Option<BackgroundLight<'_>> {
+        if (picture.width, picture.height) != (self.width, self.height) {
+            return None;
+        }
+        match (&self.kind, &seen.exposure) {
+            (Kind::Plate(plate), Exposure::Plate(drift)) => Some(BackgroundLight::Plate(plate, *drift)),
+            (Kind::Key(key), Exposure::Screen(screen)) if screen.fits(picture) => {
+                Some(BackgroundLight::Screen(key, Arc::clone(screen)))
+            }
+            _ => None,
         }
     }
 }

@@ -1,5 +1,7 @@
 //! A camera's background in the exposure of one image: evidence for a foreground, and linear light behind it.
 
+use std::sync::Arc;
+
 use crate::image::grid::Grid;
 use crate::image::light::linear;
 use crate::image::pixels::Rgb;
@@ -11,13 +13,28 @@ use crate::masks::plate_evidence::{NO_EVIDENCE, plate_evidence};
 /// Share of the background around the body that must be known for a mask from background and body alone.
 pub(crate) const MOSTLY_KNOWN: f64 = 0.7;
 
+/// Exposure of one image.
+#[derive(Debug, Clone, PartialEq)]
+pub(crate) enum Exposure {
+    Plate(Drift),
+    Screen(Arc<Screen>),
+}
+
 /// Background in the exposure of one image.
 pub(crate) enum BackgroundLight<'a> {
     Plate(&'a Plate, Drift),
-    Screen(&'a KeyColor, Screen),
+    Screen(&'a KeyColor, Arc<Screen>),
 }
 
 impl BackgroundLight<'_> {
+    /// Returns the exposure, without the background that it belongs to.
+    pub fn exposure(&self) -> Exposure {
+        match self {
+            Self::Plate(_, drift) => Exposure::Plate(*drift),
+            Self::Screen(_, screen) => Exposure::Screen(Arc::clone(screen)),
+        }
+    }
+
     /// Returns per-pixel evidence for a foreground inside `bounds` (x0, y0, x1, y1, ends excluded) of the image that this
     /// was made for, 0..=1 with the border at one half; `None` while no pixel is known there.
     pub fn evidence(&self, picture: &Rgb, bounds: [usize; 4]) -> Option<Grid> {
@@ -38,14 +55,6 @@ impl BackgroundLight<'_> {
             }
         }
         (known > 0).then_some(evidence)
-    }
-
-    /// Returns the share of `bounds` where the background is known, 0..=1.
-    pub fn known_share(&self, width: usize, bounds: [usize; 4]) -> f64 {
-        let Self::Plate(plate, _) = self else { return 1.0 };
-        let [x0, y0, x1, y1] = bounds;
-        let known = (y0..y1).map(|y| (x0..x1).filter(|x| plate.knows(y * width + x)).count()).sum::<usize>();
-        known as f64 / ((x1 - x0) * (y1 - y0)).max(1) as f64
     }
 
     /// Returns the linear light of a pixel, 0..=1 by channel; `None` where the background is unknown.

@@ -43,11 +43,11 @@ impl BodyGate {
         let depth = flyrig_solve::median(&mut depths)?;
         let depths_m = depths.iter().fold([f64::INFINITY, 0.0], |[low, high], z| [z.min(low), z.max(high)]);
         let px_per_m = camera.intrinsics.focal_px.x / depth;
-        let reach = REACH_M * px_per_m;
-        let (bounds, body) = drawn_body(camera, vertices, triangles, reach * f64::from(CLOTHES_REACH))?;
+        let unit_px = REACH_M * px_per_m;
+        let (bounds, body) = drawn_body(camera, vertices, triangles, unit_px * f64::from(CLOTHES_REACH))?;
         let mut distance = body.distance_to_set();
         for value in &mut distance.values {
-            *value /= reach as f32;
+            *value /= unit_px as f32;
         }
         let image = [camera.intrinsics.width as usize, camera.intrinsics.height as usize];
         Some(Self { image, bounds, distance, px_per_m, reach: CLOTHES_REACH, depths_m })

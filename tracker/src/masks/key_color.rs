@@ -76,6 +76,7 @@ impl fmt::Display for KeyColor {
 }
 
 /// Screen as one image shows it.
+#[derive(Debug, PartialEq)]
 pub(crate) struct Screen {
     /// Chroma of each pixel along the key's, over that of the screen there: 1 on the screen.
     share: Grid,
@@ -88,6 +89,11 @@ pub(crate) struct Screen {
 }
 
 impl Screen {
+    /// Whether this was measured in an image of the same size.
+    pub fn fits(&self, picture: &Rgb) -> bool {
+        (self.share.width, self.share.height) == (picture.width, picture.height)
+    }
+
     /// Returns the screen's linear light at a pixel.
     pub fn at(&self, pixel: usize) -> [f32; 3] {
         self.light.map(|light| light * self.strength.values[pixel])
@@ -158,10 +164,8 @@ impl KeyColor {
         evidence
     }
 
-    /// Subtracts the screen's spill from the colours of a matte; does nothing when the image shows no screen of this
-    /// colour.
-    pub(crate) fn despill(&self, picture: &Rgb, matte: &mut Matte) {
-        let Some(screen) = self.screen(picture) else { return };
+    /// Subtracts the screen's spill from the colours of a matte of the image that shows it.
+    pub(crate) fn despill(&self, picture: &Rgb, screen: &Screen, matte: &mut Matte) {
         let mut colors = Vec::new();
         let mut solved = std::mem::take(&mut matte.colors).into_iter().peekable();
         for (at, coverage) in matte.mask.coverage().iter().enumerate() {
@@ -264,7 +268,7 @@ mod tests {
         let coverage: Vec<u8> =
             (0..SIDE * SIDE).map(|at| if truth(at % SIDE, at / SIDE) >= 0.2 { 255 } else { 0 }).collect();
         let mask = Mask::new(SIDE as u32, SIDE as u32, coverage).unwrap();
-        let solved = matte(&image, &mask, Some(&background("green"))).unwrap();
+        let solved = matte(&image, &mask, Some(&background("green")), None).unwrap();
         let mut errors = Vec::new();
         for (at, alpha) in solved.mask.coverage().iter().enumerate() {
             let truth = truth(at % SIDE, at / SIDE);
@@ -288,7 +292,7 @@ mod tests {
         assert!(key.screen(&Rgb::new(&scene()).unwrap()).is_none(), "the screen is green");
         assert!(key.screen(&Rgb::new(&black).unwrap()).is_none());
         let mask = Mask::new(SIDE as u32, SIDE as u32, vec![255; SIDE * SIDE]).unwrap();
-        let solved = matte(&black, &mask, Some(&background("blue"))).unwrap();
+        let solved = matte(&black, &mask, Some(&background("blue")), None).unwrap();
         assert_eq!(solved, Matte { mask, colors: Vec::new() });
     }
 }

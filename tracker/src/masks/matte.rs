@@ -14,6 +14,7 @@ use crate::image::pixels::Rgb;
 use crate::masks::background::Background;
 use crate::masks::background_light::BackgroundLight;
 use crate::masks::edge_color::{EdgeColor, Matte};
+use crate::masks::seen_background::SeenBackground;
 
 /// Half width of the band around the outline in which alpha is solved for, pixels.
 const BAND_PX: f32 = 3.4;
@@ -45,7 +46,8 @@ const DEEP_PX: f32 = 24.0;
 const LOOKS_EMPTY: f32 = 0.4;
 
 /// Solves for coverage and foreground colour along the outline of a mask. Without a background, or where it has another
-/// size, the colours around the mask are used.
+/// size, the colours around the mask are used. `seen` is what the estimation of the mask has measured of the background in
+/// this image; without it, it is measured here.
 ///
 /// ```
 /// use flyrig_tracker::matte;
@@ -58,7 +60,7 @@ const LOOKS_EMPTY: f32 = 0.4;
 /// let image = Image::new(64, 64, PixelFormat::Rgb8, bytes)?;
 /// let mask = Mask::new(64, 64, (0..64 * 64).map(|at| 255 * u8::from(wide(at))).collect())?;
 ///
-/// let solved = matte(&image, &mask, None)?;
+/// let solved = matte(&image, &mask, None, None)?;
 /// // Without a plate the mask keeps half its weight where it disagrees with the colours.
 /// let (before, after) = (mask.coverage()[32 * 64 + 18], solved.mask.coverage()[32 * 64 + 18]);
 /// assert!(before == 255 && after < 160, "the wall beside the square is covered less: {after}");
@@ -67,7 +69,12 @@ const LOOKS_EMPTY: f32 = 0.4;
 ///
 /// # Errors
 /// Kind `Image` when the format cannot be read or the mask is of another size.
-pub fn matte(image: &Image, mask: &Mask, background: Option<&Background>) -> Result<Matte, TrackError> {
+pub fn matte(
+    image: &Image,
+    mask: &Mask,
+    background: Option<&Background>,
+    seen: Option<&SeenBackground>,
+) -> Result<Matte, TrackError> {
     let picture = Rgb::new(image)?;
     if (mask.width() as usize, mask.height() as usize) != (picture.width, picture.height) {
         return Err(TrackError::new(
@@ -81,12 +88,17 @@ pub fn matte(image: &Image, mask: &Mask, background: Option<&Background>) -> Res
             ),
         ));
     }
-    let Some(band) = Band::new(&picture, mask, background) else {
+    let unmasked = |at: usize| mask.coverage()[at] == 0;
+    let light = background.and_then(|background| match seen {
+        Some(seen) => background.light_again(&picture, seen),
+        None => background.light(&picture, &unmasked),
+    });
+    let Some(band) = Band::new(&picture, mask, light.as_ref(), seen) else {
         return Ok(Matte { mask: mask.clone(), colors: Vec::new() });
     };
     let mut matte = band.solve(mask);
-    if let Some(key) = background.and_then(Background::key) {
-        key.despill(&picture, &mut matte);
+    if let Some(BackgroundLight::Screen(key, screen)) = &light {
+        key.despill(&picture, screen, &mut matte);
     }
     Ok(matte)
 }
@@ -119,7 +131,12 @@ const PIXELS_A_TASK: usize = 8192;
 
 impl<'a> Band<'a> {
     /// Measures the surroundings of a mask; `None` for an empty mask.
-    fn new(picture: &'a Rgb<'a>, mask: &Mask, background: Option<&Background>) -> Option<Self> {
+    fn new(
+        picture: &'a Rgb<'a>,
+        mask: &Mask,
+        light: Option<&BackgroundLight<'_>>,
+        seen: Option<&SeenBackground>,
+    ) -> Option<Self> {
         let inside = |x: usize, y: usize| mask.coverage()[y * picture.width + x] >= 128;
         let [x0, y0, x1, y1] = mask.bounding_box()?.map(|v| v as usize);
         let (x0, y0) = (x0.saturating_sub(MARGIN_PX), y0.saturating_sub(MARGIN_PX));
@@ -132,7 +149,7 @@ impl<'a> Band<'a> {
         let mut unset = set.clone();
         unset.values.iter_mut().for_each(|value| *value = 1.0 - *value);
         let (outer, inner) = rayon::join(|| set.distance_to_set(), || unset.distance_to_set());
-        let light: Vec<[f32; 3]> = (0..width * height)
+        let own_light: Vec<[f32; 3]> = (0..width * height)
             .into_par_iter()
             .with_min_len(PIXELS_A_TASK)
             .map(|at| linear_of_bytes(picture.pixel(x0 + at % width, y0 + at / width)))
@@ -143,7 +160,7 @@ impl<'a> Band<'a> {
             y0,
             width,
             height,
-            light,
+            light: own_light,
             inner,
             outer,
             nearest_inside: Vec::new(),
@@ -154,18 +171,20 @@ impl<'a> Band<'a> {
         let pixels = (0..width * height).into_par_iter().with_min_len(PIXELS_A_TASK);
         let mut sure_inside: Vec<bool> = pixels.map(|at| band.is_sure_inside(at)).collect();
         let mut sure_outside: Vec<bool> = band.outer.values.iter().map(|d| *d > BAND_PX).collect();
-        if let Some(background) = background {
-            let unmasked = |at: usize| mask.coverage()[at] == 0;
-            let light = background.light(picture, &unmasked);
-            let evidence = light.as_ref().and_then(|light| light.evidence(picture, [x0, y0, x1, y1]));
-            if let Some((light, evidence)) = light.zip(evidence) {
+        if let Some(light) = light {
+            let bounds = [x0, y0, x1, y1];
+            let evidence = match seen {
+                Some(seen) => seen.evidence_in(light, picture, bounds),
+                None => light.evidence(picture, bounds),
+            };
+            if let Some(evidence) = evidence {
                 sure_outside.iter_mut().zip(&evidence.values).for_each(|(sure, value)| *sure &= *value < 0.5);
                 for (at, value) in evidence.box_mean(1).values.iter().enumerate() {
                     let depth = band.inner.values[at];
                     band.empty[at] = depth > 0.0 && depth <= DEEP_PX && *value < LOOKS_EMPTY;
                     sure_inside[at] &= !band.empty[at] && *value > 0.5;
                 }
-                band.behind = band.local_background(&light, &sure_outside);
+                band.behind = band.local_background(light, &sure_outside);
             }
         }
         (band.nearest_inside, band.nearest_outside) =
@@ -420,6 +439,7 @@ mod tests {
     use flyrig_types::PixelFormat;
 
     use super::*;
+    use crate::masks::gate::BodyGate;
     use crate::testing::small_camera;
 
     const SIDE: usize = 64;
@@ -475,7 +495,7 @@ mod tests {
     fn alpha_and_colour_of_a_known_mixture_are_found() {
         let now = picture(|x, y| over(truth(x, y), SHIRT, wall(x, y).map(|c| c * 0.9)));
         let plate = picture(wall);
-        let solved = matte(&now, &rough(), Some(&background(&plate))).unwrap();
+        let solved = matte(&now, &rough(), Some(&background(&plate)), None).unwrap();
         assert!(error(&rough()) > 0.2 && error(&solved.mask) < 0.03, "{} {}", error(&rough()), error(&solved.mask));
         let half = |color: &&EdgeColor| (96..200).contains(&solved.mask.coverage()[color.pixel as usize]);
         let mixed: Vec<&EdgeColor> = solved.colors.iter().filter(half).collect();
@@ -487,9 +507,27 @@ mod tests {
     }
 
     #[test]
+    fn what_the_mask_has_measured_gives_the_same_matte() {
+        let now = picture(|x, y| over(truth(x, y), SHIRT, wall(x, y).map(|c| c * 0.9)));
+        let known = background(&picture(wall));
+        let mask = rough();
+        let mut body = Grid::new(mask.width() as usize, mask.height() as usize, 0.0);
+        body.values.iter_mut().zip(mask.coverage()).for_each(|(value, alpha)| *value = f32::from(*alpha >= 128));
+        let seen = known.seen(&Rgb::new(&now).unwrap(), &BodyGate::of_grid(&body, 40.0)).unwrap();
+        let (anew, again) =
+            (matte(&now, &mask, Some(&known), None).unwrap(), matte(&now, &mask, Some(&known), Some(&seen)).unwrap());
+        let differences = anew.mask.coverage().iter().zip(again.mask.coverage()).map(|(a, b)| a.abs_diff(*b));
+        assert!(differences.max() < Some(4) && anew != matte(&now, &mask, None, None).unwrap());
+        // Measured before a screen, or in an image of another size: the colours around stand in.
+        let screen = Background::from_key(&small_camera("a", 64), "green".parse().unwrap());
+        let without = matte(&now, &mask, None, None).unwrap();
+        assert_eq!(matte(&now, &mask, Some(&screen), Some(&seen)).unwrap(), without);
+    }
+
+    #[test]
     fn without_a_plate_the_colours_around_stand_in() {
         let now = picture(|x, y| over(truth(x, y), SHIRT, wall(x, y)));
-        let solved = matte(&now, &rough(), None).unwrap();
+        let solved = matte(&now, &rough(), None, None).unwrap();
         assert!(error(&solved.mask) < 0.7 * error(&rough()), "{} {}", error(&rough()), error(&solved.mask));
     }
 
@@ -512,7 +550,7 @@ mod tests {
     fn alike_colours_keep_the_masks_alpha() {
         let now = picture(wall);
         let rough = rough();
-        let solved = matte(&now, &rough, Some(&background(&now))).unwrap();
+        let solved = matte(&now, &rough, Some(&background(&now)), None).unwrap();
         let changed = rough.coverage().iter().zip(solved.mask.coverage()).filter(|(a, b)| a.abs_diff(**b) > 64).count();
         assert!(changed < 20, "{changed} pixels changed");
     }
@@ -523,13 +561,16 @@ mod tests {
         let plate = background(&black);
         for coverage in [0, 255] {
             let mask = mask(|_, _| coverage);
-            assert_eq!(matte(&black, &mask, Some(&plate)).unwrap(), Matte { mask, colors: Vec::new() });
+            assert_eq!(matte(&black, &mask, Some(&plate), None).unwrap(), Matte { mask, colors: Vec::new() });
         }
         // A mask that touches three borders, and one of a single pixel.
-        matte(&black, &rough(), None).unwrap();
-        matte(&black, &mask(|x, y| if (x, y) == (0, 63) { 255 } else { 0 }), Some(&plate)).unwrap();
+        matte(&black, &rough(), None, None).unwrap();
+        matte(&black, &mask(|x, y| if (x, y) == (0, 63) { 255 } else { 0 }), Some(&plate), None).unwrap();
         let small = Image::new(8, 8, PixelFormat::Rgb8, vec![0; 192]).unwrap();
-        assert!(matte(&small, &rough(), None).is_err());
-        assert!(matte(&black, &rough(), Some(&background(&small))).is_ok(), "a plate of another size is not used");
+        assert!(matte(&small, &rough(), None, None).is_err());
+        assert!(
+            matte(&black, &rough(), Some(&background(&small)), None).is_ok(),
+            "a plate of another size is not used"
+        );
     }
 }

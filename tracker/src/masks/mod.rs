@@ -14,5 +14,6 @@ pub(crate) mod person_area;
 mod plate;
 mod plate_evidence;
 mod plate_shift;
+pub(crate) mod seen_background;
 pub(crate) mod silhouette;
 pub(crate) mod support;

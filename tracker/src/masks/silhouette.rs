@@ -7,9 +7,9 @@ use flyrig_types::Mask;
 use glam::DVec2;
 use rayon::prelude::*;
 
+use crate::image::crop::Crop;
 use crate::image::grid::{Grid, clean};
 use crate::image::pixels::Rgb;
-use crate::landmarks::sighting::Sighting;
 use crate::masks::gate::BodyGate;
 use crate::masks::plate_evidence::NO_EVIDENCE;
 use crate::network::output::NET_SIDE;
@@ -24,23 +24,21 @@ const BINS: usize = 16;
 const CLOTHES: f32 = 0.2;
 const FADE: f32 = 0.1;
 
-/// Returns the network's probability of a person inside the gate's bounds, or one from the body alone where the network has
-/// no mask.
-pub(crate) fn coarse_mask(sighting: &Sighting, gate: &BodyGate) -> Grid {
+/// Returns the network's probability of a person in a crop inside the gate's bounds.
+pub(crate) fn coarse_mask(mask: &[f32], crop: Crop, gate: &BodyGate) -> Grid {
     let [x0, y0, x1, y1] = gate.bounds;
-    let Some(mask) = &sighting.output.mask else { return body_mask(gate) };
     let mut coarse = Grid::new(x1 - x0, y1 - y0, 0.0);
     coarse.rows_mut().for_each(|(y, row)| {
         for (x, value) in row.iter_mut().enumerate() {
             let pixel = DVec2::new((x + x0) as f64, (y + y0) as f64);
-            *value = net_probability(mask, sighting.crop.crop_from_image(pixel));
+            *value = net_probability(mask, crop.crop_from_image(pixel));
         }
     });
     coarse
 }
 
-/// Returns a probability from the distance to the body alone.
-fn body_mask(gate: &BodyGate) -> Grid {
+/// Returns a probability from the distance to the body alone, for a network that has no mask.
+pub(crate) fn body_mask(gate: &BodyGate) -> Grid {
     let mut coarse = gate.distance.clone();
     coarse.values.iter_mut().for_each(|distance| *distance = 1.0 / (1.0 + ((*distance - CLOTHES) / FADE).exp()));
     coarse
@@ -92,13 +90,15 @@ pub(crate) fn refine(
         .with_min_len(512)
         .map(|bin| if speaks { color_logit(bin) } else { 0.0 })
         .collect();
-    let mut probability = coarse.clone();
+    let radius = (1.5 * crop_scale).round().clamp(2.0, 12.0) as usize;
+    let [left, top, right, bottom] = reached(gate, 2 * radius)?;
+    let mut probability = Grid::new(right - left, bottom - top, 0.0);
     probability.rows_mut().for_each(|(y, row)| {
         for (x, probability) in row.iter_mut().enumerate() {
+            let (x, y) = (x + left, y + top);
             let at = y * width + x;
             let (p, d) = (coarse.values[at].clamp(0.02, 0.98), gate.distance.values[at]);
             if d >= gate.reach {
-                *probability = 0.0;
                 continue;
             }
             let color = color_logits[bin(x, y)];
@@ -107,25 +107,43 @@ pub(crate) fn refine(
             let plate = evidence * if evidence > 0.0 { DIFFERENT_LOGIT } else { PLATE_LOGIT };
             // The plate knows better how the surroundings look at this pixel: shoes of the floor's colour are no floor.
             let color = if evidence == 0.0 { color } else { color.max(0.0) };
-            let logit = (p / (1.0 - p)).ln() + 0.6 * color + near + plate;
-            *probability = 1.0 / (1.0 + (-logit).exp());
+            let odds = (0.6 * color + near + plate).exp() * p / (1.0 - p);
+            *probability = odds / (1.0 + odds);
         }
     });
-    let mut guide = Grid::new(width, height, 0.0);
+    let mut guide = Grid::new(right - left, bottom - top, 0.0);
     guide.rows_mut().for_each(|(y, row)| {
         for (x, guide) in row.iter_mut().enumerate() {
-            let [r, g, b] = picture.pixel(x + x0, y + y0).map(f32::from);
+            let [r, g, b] = picture.pixel(x + left + x0, y + top + y0).map(f32::from);
             *guide = (0.3 * r + 0.55 * g + 0.15 * b) / 255.0;
         }
     });
-    let radius = (1.5 * crop_scale).round().clamp(2.0, 12.0) as usize;
     let mut smoothed = probability.guided(&guide, radius, 1e-3);
-    for (value, d) in smoothed.values.iter_mut().zip(&gate.distance.values) {
-        // A soft step around one half keeps about a pixel of slope.
-        *value = if *d >= gate.reach { 0.0 } else { ((*value - 0.5) * 3.0 + 0.5).clamp(0.0, 1.0) };
-    }
+    smoothed.rows_mut().for_each(|(y, row)| {
+        let distances = &gate.distance.values[(y + top) * width + left..];
+        for (value, d) in row.iter_mut().zip(distances) {
+            // A soft step around one half keeps about a pixel of slope.
+            *value = if *d >= gate.reach { 0.0 } else { ((*value - 0.5) * 3.0 + 0.5).clamp(0.0, 1.0) };
+        }
+    });
     clean(&mut smoothed, (0.02 * gate.px_per_m).round() as usize);
-    smoothed.paste(picture.width, picture.height, x0, y0)
+    smoothed.paste(picture.width, picture.height, x0 + left, y0 + top)
+}
+
+/// Returns the part of a gate's bounds that the person may cover, with a margin: left, top, right, bottom (ends excluded);
+/// `None` where that is nothing.
+fn reached(gate: &BodyGate, margin: usize) -> Option<[usize; 4]> {
+    let Grid { width, height, values } = &gate.distance;
+    let is_near = |d: &f32| *d < gate.reach;
+    let rows = values.chunks_exact((*width).max(1));
+    let spans = rows.map(|row| Some((row.iter().position(is_near)?, row.iter().rposition(is_near)?)));
+    let spans: Vec<(usize, (usize, usize))> =
+        spans.enumerate().filter_map(|(y, span)| span.map(|span| (y, span))).collect();
+    let (top, bottom) = (spans.first()?.0, spans.last()?.0);
+    let left = spans.iter().map(|(_, (first, _))| *first).min()?;
+    let right = spans.iter().map(|(_, (_, last))| *last).max()?;
+    let end = |last: usize, side: usize| (last + 1 + margin).min(side);
+    Some([left.saturating_sub(margin), top.saturating_sub(margin), end(right, *width), end(bottom, *height)])
 }
 
 /// Returns a bin's count and a share of its neighbours' counts.

@@ -31,11 +31,7 @@ impl LandmarkNet {
     /// # Errors
     /// Kind [`TrackErrorKind::Net`] when the file does not load.
     pub fn load(bytes: &[u8], side: usize, name: &str) -> Result<Self, TrackError> {
-        let hint = "use a file that convert_mediapipe.py made";
-        Self::load_shaped(bytes, |_| Ok([1, side, side, 3]), name).map_err(|mut error| {
-            error.message = format!("{}; {hint}", error.message);
-            error
-        })
+        LoadedNet::of_crops(bytes, side, name)?.runnable()
     }
 
     /// Loads an ONNX file. `shape` chooses the shape of the input from its sides; those that the file leaves open are
@@ -44,34 +40,11 @@ impl LandmarkNet {
     /// # Errors
     /// Kind [`TrackErrorKind::Net`] when the file does not load, or with the message of `shape`.
     pub fn load_shaped(
-        mut bytes: &[u8],
+        bytes: &[u8],
         shape: impl FnOnce(&[Option<usize>]) -> Result<[usize; 4], String>,
         name: &str,
     ) -> Result<Self, TrackError> {
-        let failed = |what: String| TrackError::new(TrackErrorKind::Net, format!("the {name} network {what}"));
-        let failed_load = |error: TractError| failed(format!("does not load ({error:#})"));
-        let model = onnx().model_for_read(&mut bytes).map_err(failed_load)?;
-        let sides = &model.input_fact(0).map_err(failed_load)?.shape;
-        let sides: Vec<Option<usize>> = sides
-            .dims()
-            .map(|side| {
-                side.concretize().and_then(|side| side.to_i64().ok()).and_then(|side| usize::try_from(side).ok())
-            })
-            .collect();
-        let shape = shape(&sides).map_err(failed)?;
-        let model = model
-            .with_input_fact(0, f32::fact(shape).into())
-            .and_then(InferenceModelExt::into_typed)
-            .and_then(TypedModel::into_decluttered)
-            .and_then(|mut model| {
-                replace_depthwise(&mut model)?;
-                let mut model = model.into_optimized()?;
-                replace_doublings(&mut model)?;
-                clear_after_products(&mut model)?;
-                model.into_runnable()
-            })
-            .map_err(failed_load)?;
-        Ok(Self { model, shape, name: name.into() })
+        LoadedNet::new(bytes, shape, name)?.runnable()
     }
 
     /// Runs one crop, whose numbers are in the order of the input's shape.
@@ -101,8 +74,97 @@ impl LandmarkNet {
 
     /// Creates an error that names this network.
     pub fn failed(&self, message: &str) -> TrackError {
-        TrackError::new(TrackErrorKind::Net, format!("the {} network {message}", self.name))
+        failed(&self.name, message)
     }
+}
+
+/// Network that was read from its file and can be made ready to run, whole or in part.
+#[derive(Clone)]
+pub(crate) struct LoadedNet {
+    model: TypedModel,
+    shape: [usize; 4],
+    name: Arc<str>,
+}
+
+impl LoadedNet {
+    /// Reads an ONNX file as [`LandmarkNet::load`] does.
+    ///
+    /// # Errors
+    /// Kind [`TrackErrorKind::Net`] when the file does not load.
+    pub fn of_crops(bytes: &[u8], side: usize, name: &str) -> Result<Self, TrackError> {
+        let hint = "use a file that convert_mediapipe.py made";
+        Self::new(bytes, |_| Ok([1, side, side, 3]), name).map_err(|mut error| {
+            error.message = format!("{}; {hint}", error.message);
+            error
+        })
+    }
+
+    /// Reads an ONNX file as [`LandmarkNet::load_shaped`] does.
+    fn new(
+        mut bytes: &[u8],
+        shape: impl FnOnce(&[Option<usize>]) -> Result<[usize; 4], String>,
+        name: &str,
+    ) -> Result<Self, TrackError> {
+        let model = onnx().model_for_read(&mut bytes).map_err(|error| failed_load(name, &error))?;
+        let sides = &model.input_fact(0).map_err(|error| failed_load(name, &error))?.shape;
+        let sides: Vec<Option<usize>> = sides
+            .dims()
+            .map(|side| {
+                side.concretize().and_then(|side| side.to_i64().ok()).and_then(|side| usize::try_from(side).ok())
+            })
+            .collect();
+        let shape = shape(&sides).map_err(|what| failed(name, &what))?;
+        let model = model
+            .with_input_fact(0, f32::fact(shape).into())
+            .and_then(InferenceModelExt::into_typed)
+            .and_then(TypedModel::into_decluttered)
+            .and_then(|mut model| replace_depthwise(&mut model).map(|()| model))
+            .map_err(|error| failed_load(name, &error))?;
+        Ok(Self { model, shape, name: name.into() })
+    }
+
+    /// Drops the outputs of `count` numbers, and what only they need.
+    ///
+    /// # Errors
+    /// Kind [`TrackErrorKind::Net`] when nothing would be left.
+    pub fn without_output(mut self, count: usize) -> Result<Self, TrackError> {
+        let of_size = |outlet: &OutletId| {
+            let shape =
+                self.model.outlet_fact(*outlet).ok().and_then(|fact| fact.shape.as_concrete().map(<[_]>::to_vec));
+            shape.is_some_and(|shape| shape.iter().product::<usize>() == count)
+        };
+        let kept: Vec<OutletId> = self.model.outputs.iter().filter(|outlet| !of_size(outlet)).copied().collect();
+        if kept.is_empty() {
+            return Err(failed(&self.name, &format!("has no output but those of {count} numbers")));
+        }
+        self.model.select_output_outlets(&kept).map_err(|error| failed_load(&self.name, &error))?;
+        Ok(self)
+    }
+
+    /// Makes the network ready to run.
+    ///
+    /// # Errors
+    /// Kind [`TrackErrorKind::Net`] when an operation cannot be prepared.
+    pub fn runnable(self) -> Result<LandmarkNet, TrackError> {
+        let Self { model, shape, name } = self;
+        let model = model
+            .into_optimized()
+            .and_then(|mut model| {
+                replace_doublings(&mut model)?;
+                clear_after_products(&mut model)?;
+                model.into_runnable()
+            })
+            .map_err(|error| failed_load(&name, &error))?;
+        Ok(LandmarkNet { model, shape, name })
+    }
+}
+
+fn failed(name: &str, what: &str) -> TrackError {
+    TrackError::new(TrackErrorKind::Net, format!("the {name} network {what}"))
+}
+
+fn failed_load(name: &str, error: &TractError) -> TrackError {
+    failed(name, &format!("does not load ({error:#})"))
 }
 
 /// Shape of an output and its numbers, row by row.

@@ -7,13 +7,16 @@ use crate::image::crop::Crop;
 use crate::image::pixels::Rgb;
 use crate::landmarks::keypoints::LANDMARK_COUNT;
 use crate::network::chosen_net::ChosenNet;
-use crate::network::landmark_net::{LandmarkNet, sigmoid};
+use crate::network::landmark_net::{LandmarkNet, LoadedNet, sigmoid};
 use crate::network::output::{CropLandmark, NET_SIDE, NetOutput};
 
 /// Floats per landmark in BlazePose's output.
 const LANDMARK_STRIDE: usize = 5;
 /// Landmarks of BlazePose: 33 of the body, and 6 helpers of the original's tracking that are not used.
 const NET_LANDMARKS: usize = 39;
+
+/// Numbers of BlazePose's mask.
+const MASK_SIZE: usize = NET_SIDE * NET_SIDE;
 
 static EMBEDDED: &[u8] = include_bytes!("../../assets/pose_full.onnx");
 
@@ -26,7 +29,12 @@ pub struct PoseNet {
 
 #[derive(Clone)]
 enum Kind {
-    BlazePose(LandmarkNet),
+    BlazePose {
+        /// All outputs.
+        whole: LandmarkNet,
+        /// Without the mask, whose branch is a quarter of the work.
+        without_mask: LandmarkNet,
+    },
     Chosen(Box<ChosenNet>),
 }
 
@@ -50,9 +58,11 @@ impl PoseNet {
     /// # Errors
     /// Kind [`crate::TrackErrorKind::Net`] when the file does not load or has other inputs or outputs.
     pub fn from_onnx(bytes: &[u8]) -> Result<Self, TrackError> {
-        let net = LandmarkNet::load(bytes, NET_SIDE, "pose")?;
-        run_blazepose(&net, &net.blank())?;
-        Ok(Self { kind: Kind::BlazePose(net) })
+        let loaded = LoadedNet::of_crops(bytes, NET_SIDE, "pose")?;
+        let without_mask = loaded.clone().without_output(MASK_SIZE)?.runnable()?;
+        let whole = loaded.runnable()?;
+        run_blazepose(&whole, &whole.blank(), true)?;
+        Ok(Self { kind: Kind::BlazePose { whole, without_mask } })
     }
 
     /// Loads a network of the user's choice from a TOML file that describes it (docs/guide/people.md).
@@ -66,29 +76,33 @@ impl PoseNet {
     /// Whether outputs hold a mask and the depth of landmarks.
     #[must_use]
     pub fn sees_depth(&self) -> bool {
-        matches!(self.kind, Kind::BlazePose(_))
+        matches!(self.kind, Kind::BlazePose { .. })
     }
 
-    /// Runs the network on a square of an image.
+    /// Runs the network on a square of an image. Without `with_mask`, the output holds none, and takes less time.
     ///
     /// # Errors
     /// Kind [`crate::TrackErrorKind::Net`] when the network fails, or an output is missing or not finite.
-    pub(crate) fn infer(&self, picture: &Rgb, crop: Crop) -> Result<NetOutput, TrackError> {
+    pub(crate) fn infer(&self, picture: &Rgb, crop: Crop, with_mask: bool) -> Result<NetOutput, TrackError> {
         match &self.kind {
-            Kind::BlazePose(net) => run_blazepose(net, &crop.sample(picture)),
+            Kind::BlazePose { whole, without_mask } => {
+                let net = if with_mask { whole } else { without_mask };
+                run_blazepose(net, &crop.sample(picture), with_mask)
+            }
             Kind::Chosen(net) => net.infer(picture, crop),
         }
     }
 }
 
 /// Runs BlazePose on a crop of 256 x 256 x 3 values, RGB in 0..=1, row by row.
-fn run_blazepose(net: &LandmarkNet, rgb: &[f32]) -> Result<NetOutput, TrackError> {
+fn run_blazepose(net: &LandmarkNet, rgb: &[f32], with_mask: bool) -> Result<NetOutput, TrackError> {
     let outputs = net.run(rgb)?;
     let find = |count| outputs.of_size(count);
     let raw = find(NET_LANDMARKS * LANDMARK_STRIDE)?;
     let world = find(NET_LANDMARKS * 3)?;
     let presence = f64::from(find(1)?[0]).clamp(0.0, 1.0);
-    let mask = find(NET_SIDE * NET_SIDE)?.into_iter().map(|logit| 1.0 / (1.0 + (-logit).exp())).collect();
+    let logits = with_mask.then(|| find(MASK_SIZE)).transpose()?;
+    let mask = logits.map(|logits| logits.into_iter().map(|logit| 1.0 / (1.0 + (-logit).exp())).collect());
     let mut landmarks = [CropLandmark::default(); LANDMARK_COUNT];
     for (i, landmark) in landmarks.iter_mut().enumerate() {
         let [x, y, _, visible, present] = std::array::from_fn(|k| f64::from(raw[i * LANDMARK_STRIDE + k]));
@@ -100,7 +114,7 @@ fn run_blazepose(net: &LandmarkNet, rgb: &[f32]) -> Result<NetOutput, TrackError
             world: Some(std::array::from_fn(|k| f64::from(world[i * 3 + k]))),
         };
     }
-    Ok(NetOutput { landmarks, presence, mask: Some(mask) })
+    Ok(NetOutput { landmarks, presence, mask })
 }
 
 #[cfg(test)]
@@ -119,20 +133,25 @@ mod tests {
     #[test]
     fn the_embedded_network_sees_nobody_in_grey_and_refuses_a_wrong_size() {
         let net = PoseNet::embedded().unwrap();
-        let output = net.infer(&grey(), whole()).unwrap();
+        let output = net.infer(&grey(), whole(), true).unwrap();
+        let without = net.infer(&grey(), whole(), false).unwrap();
+        assert!(
+            without.mask.is_none() && without.landmarks == output.landmarks,
+            "the mask's branch changes nothing else"
+        );
         assert!(output.presence < 0.5, "presence {}", output.presence);
         let mask = output.mask.unwrap();
         assert_eq!(mask.len(), NET_SIDE * NET_SIDE);
         assert!(mask.iter().all(|p| (0.0..=1.0).contains(p)));
-        let Kind::BlazePose(net) = net.kind else { panic!("the embedded network is BlazePose") };
-        assert_eq!(run_blazepose(&net, &[0.5; 12]).unwrap_err().kind, TrackErrorKind::Net);
+        let Kind::BlazePose { whole, .. } = net.kind else { panic!("the embedded network is BlazePose") };
+        assert_eq!(run_blazepose(&whole, &[0.5; 12], true).unwrap_err().kind, TrackErrorKind::Net);
     }
 
     #[test]
     fn runs_from_many_threads_and_from_rayons_own_do_not_meet() {
         use rayon::prelude::*;
         let net = PoseNet::embedded().unwrap();
-        let run = |_| net.infer(&grey(), whole()).unwrap().presence.to_bits();
+        let run = |_| net.infer(&grey(), whole(), true).unwrap().presence.to_bits();
         let expected = run(0);
         std::thread::scope(|scope| {
             for thread in 0..4 {

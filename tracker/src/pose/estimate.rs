@@ -4,6 +4,7 @@ use flyrig_types::{Mask, Pose};
 use glam::DVec3;
 
 use crate::landmarks::keypoints::{LANDMARK_COUNT, ViewKeypoints};
+use crate::masks::seen_background::SeenBackground;
 
 /// Reason why a camera has no mask in a frame set.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -75,6 +76,8 @@ pub struct PoseEstimate {
     pub pose: Pose,
     /// Person's mask in each view, at the image's size, in rig order.
     pub masks: Vec<Option<Mask>>,
+    /// Background around the person as the estimation of each mask has measured it, in rig order.
+    pub backgrounds: Vec<Option<SeenBackground>>,
     /// Landmarks of each view in which the network ran and found the person, in rig order.
     pub keypoints: Vec<Option<ViewKeypoints>>,
     /// Triangulated landmarks in the world, metres.

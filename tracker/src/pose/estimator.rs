@@ -10,6 +10,7 @@ mod masks;
 mod refine;
 mod shape;
 
+use masks::Masks;
 pub use shape::ShapeSighting;
 
 use std::sync::Arc;
@@ -35,7 +36,8 @@ use crate::masks::background::Background;
 use crate::masks::carried_mask::{carried_mask, corners};
 use crate::masks::gate::BodyGate;
 use crate::masks::gated_mask::gated_mask;
-use crate::masks::silhouette::{coarse_mask, refine};
+use crate::masks::seen_background::SeenBackground;
+use crate::masks::silhouette::{body_mask, coarse_mask, refine};
 use crate::network::parallel::map_parallel;
 use crate::network::pose_net::PoseNet;
 use crate::pose::body_model::{BodyModel, JointTurns};
@@ -371,12 +373,12 @@ impl PoseEstimator {
         let known = self.track.as_mut().map(|track| std::mem::take(&mut track.texture));
         let mut texture = known.unwrap_or_else(|| Texture::new(&self.surface, self.rig.cameras.len()));
         let before = (fitted.inferred() == 0).then(|| texture.clone());
-        let (mut fitted, mut masks) = self.finish(set, &pictures, fitted, &mut texture, &mut seconds);
+        let (mut fitted, mut masks, mut backgrounds) = self.finish(set, &pictures, fitted, &mut texture, &mut seconds);
         if let Some(before) = before
             && let Some(again) = self.infer_after_refinement(set, &pictures, &fitted.turns, others, &mut seconds)?
         {
             texture = before;
-            (fitted, masks) = self.finish(set, &pictures, again, &mut texture, &mut seconds);
+            (fitted, masks, backgrounds) = self.finish(set, &pictures, again, &mut texture, &mut seconds);
         }
         let inferred = fitted.inferred();
         self.sighting = self.keeps_sightings.then(|| ShapeSighting { set: set.clone(), fitted: fitted.clone() });
@@ -384,6 +386,7 @@ impl PoseEstimator {
         Ok(PoseEstimate {
             pose: self.model.to_pose(&fitted.turns),
             masks,
+            backgrounds,
             keypoints: fitted.keypoints,
             quality: PoseQuality {
                 views: fitted.views,
@@ -404,9 +407,10 @@ impl PoseEstimator {
         mut fitted: Fitted,
         texture: &mut Texture,
         seconds: &mut StageSeconds,
-    ) -> (Fitted, Vec<Option<Mask>>) {
+    ) -> (Fitted, Vec<Option<Mask>>, Vec<Option<SeenBackground>>) {
         let start = Instant::now();
-        let mut masks = self.masks(set, pictures, &mut fitted);
+        let body = self.posed(set, &fitted, &fitted.turns);
+        let Masks { mut masks, gates, backgrounds } = self.masks(set, pictures, &mut fitted, &body);
         seconds.masks += start.elapsed().as_secs_f64();
         if self.config.outline_rounds > 0 {
             let start = Instant::now();
@@ -415,13 +419,14 @@ impl PoseEstimator {
             } else {
                 set.frames.iter().map(|frame| frame.as_ref().and_then(|frame| frame.mask.as_ref())).collect()
             };
-            fitted.turns = self.refine(set, pictures, &fitted, &given, texture);
+            let gates = if self.gates_show_surface() { gates.as_slice() } else { &[] };
+            fitted.turns = self.refine(set, pictures, &fitted, &given, (body, gates), texture);
             seconds.outline += start.elapsed().as_secs_f64();
         }
         if !self.config.masks {
             masks.fill(None);
         }
-        (fitted, masks)
+        (fitted, masks, backgrounds)
     }
 
     /// Extrapolates the person's landmarks to a time in nanoseconds; `None` while no person is tracked.

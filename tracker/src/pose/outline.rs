@@ -8,7 +8,7 @@ use flyrig_types::{Camera, Mask};
 use glam::{DVec2, DVec3, Vec3};
 
 use crate::image::view::View;
-use crate::masks::gate::drawn_body;
+use crate::masks::gate::{BodyGate, drawn_body};
 use crate::pose::body_model::BodyModel;
 use crate::pose::line_point::{LineKind, LinePoint, bones, undistorted_line};
 
@@ -28,20 +28,30 @@ pub(crate) struct SeenBody<'a> {
     /// World positions and normals of the template's vertices at the image's time.
     pub vertices: &'a [Vec3],
     pub normals: &'a [Vec3],
+    /// Gate in which these vertices are drawn already; `None` draws them.
+    pub gate: Option<&'a BodyGate>,
 }
 
 impl SeenBody<'_> {
     /// Matches points on the body's outline with the mask's within `reach_m` metres along the outline's normal. Ends of the
     /// mask at the image's border are ignored. `sigma_m` is the standard deviation of the distance, metres.
     pub fn match_mask(&self, mask: &Mask, view: usize, reach_m: f64, sigma_m: f64) -> Vec<LinePoint> {
-        let Some((bounds, body)) = drawn_body(self.camera, self.vertices, &self.template.triangles, 8.0) else {
-            return Vec::new();
+        let own;
+        let (bounds, grid, is_body): (_, _, fn(f32) -> bool) = match self.gate {
+            Some(gate) => (gate.bounds, &gate.distance, |distance| distance <= 0.0),
+            None => {
+                let Some(drawn) = drawn_body(self.camera, self.vertices, &self.template.triangles, 8.0) else {
+                    return Vec::new();
+                };
+                own = drawn;
+                (own.0, &own.1, |value| value > 0.5)
+            }
         };
         let eye = self.view.center();
         let drawn = |at: DVec2| {
             let (x, y) = (at.x.round() - bounds[0] as f64, at.y.round() - bounds[1] as f64);
-            let inside = x >= 0.0 && y >= 0.0 && (x as usize) < body.width && (y as usize) < body.height;
-            inside && body.values[y as usize * body.width + x as usize] > 0.5
+            let inside = x >= 0.0 && y >= 0.0 && (x as usize) < grid.width && (y as usize) < grid.height;
+            inside && is_body(grid.values[y as usize * grid.width + x as usize])
         };
         // One point per cell, so that dense parts of the mesh (face, hands) do not outweigh the others.
         let mut cells: std::collections::BTreeMap<(i64, i64), (f64, usize, DVec2, DVec2)> = Default::default();
@@ -133,8 +143,16 @@ mod tests {
     fn matched(camera: &Camera, mask: &Mask, template: &Template, pose: &Pose) -> Vec<LinePoint> {
         let (vertices, normals) = skin_mesh(template, pose);
         let (view, model) = (View::new(camera), BodyModel::new(template).unwrap());
-        let seen = SeenBody { camera, view: &view, template, model: &model, vertices: &vertices, normals: &normals };
-        seen.match_mask(mask, 0, 0.1, 0.01)
+        let seen = |gate| {
+            let (vertices, normals) = (&vertices, &normals);
+            SeenBody { camera, view: &view, template, model: &model, vertices, normals, gate }
+        };
+        let points = seen(None).match_mask(mask, 0, 0.1, 0.01);
+        // A gate that shows the same body changes nothing.
+        if let Some(gate) = BodyGate::new(camera, &vertices, &template.triangles) {
+            assert_eq!(seen(Some(&gate)).match_mask(mask, 0, 0.1, 0.01).len(), points.len());
+        }
+        points
     }
 
     fn place(model: &BodyModel, turns: &JointTurns, point: &LinePoint) -> DVec3 {

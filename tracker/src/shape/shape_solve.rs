@@ -209,7 +209,8 @@ mod tests {
         let (vertices, normals) = skin_mesh(template, &model.to_pose(turns));
         let one = |(index, camera): (usize, &Camera)| {
             let view = View::new(camera);
-            let seen = SeenBody { camera, view: &view, template, model, vertices: &vertices, normals: &normals };
+            let seen =
+                SeenBody { camera, view: &view, template, model, vertices: &vertices, normals: &normals, gate: None };
             seen.match_mask(&mask_of(camera, truth, &true_model.to_pose(true_turns)), index, 0.1, 0.01)
         };
         cameras.iter().enumerate().flat_map(one).collect()

@@ -253,7 +253,7 @@ impl GivenPerception {
         let are_dressed = self.outfits.iter().all(OutfitSearch::is_over);
         let gate = if are_dressed { gate.of_known_clothes() } else { gate };
         let Some(mask) = background.mask(&frame.image, &gate)? else { return Ok(None) };
-        Ok(Some(matte(&frame.image, &mask, Some(background))?))
+        Ok(Some(matte(&frame.image, &mask, Some(background), None)?))
     }
 
     /// Divides the masks of all people: one element per person, then per present frame.

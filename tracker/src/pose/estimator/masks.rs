@@ -3,25 +3,51 @@
 //! A view's mask joins the network's coarse mask (warped from its last inference), the background and the body's gate;
 //! without an inference that shows the person, it comes from the background and the gate alone.
 
+use super::refine::PosedBody;
 use super::*;
 use crate::masks::background_light::MOSTLY_KNOWN;
 use crate::masks::support::drop_unsupported;
 
+/// Masks of one frame set and what they were made of, in rig order.
+pub(super) struct Masks {
+    pub masks: Vec<Option<Mask>>,
+    pub gates: Vec<Option<BodyGate>>,
+    pub backgrounds: Vec<Option<SeenBackground>>,
+}
+
+impl Masks {
+    /// Returns no mask of any view.
+    fn none(views: usize) -> Self {
+        Self { masks: vec![None; views], gates: vec![None; views], backgrounds: vec![None; views] }
+    }
+}
+
 impl PoseEstimator {
-    /// Estimates the masks, in rig order; the reason for a missing one goes into the view's quality.
-    pub(super) fn masks(&self, set: &FrameSet, pictures: &[Option<Rgb<'_>>], fitted: &mut Fitted) -> Vec<Option<Mask>> {
+    /// Estimates the masks around `body`, the person in the fitted pose; the reason for a missing one goes into the view's
+    /// quality.
+    pub(super) fn masks(
+        &self,
+        set: &FrameSet,
+        pictures: &[Option<Rgb<'_>>],
+        fitted: &mut Fitted,
+        body: &PosedBody,
+    ) -> Masks {
         if !self.config.masks {
-            return vec![None; pictures.len()];
+            return Masks::none(pictures.len());
         }
-        let made: Vec<Result<(Mask, BodyGate), NoMask>> = pictures
+        let made: Vec<Result<(Mask, BodyGate, Option<SeenBackground>), NoMask>> = pictures
             .par_iter()
             .enumerate()
             .map(|(slot, picture)| {
                 let picture = picture.as_ref().ok_or(NoMask::NoFrame)?;
                 let camera = &self.rig.cameras[slot];
-                let (vertices, _) = self.skinned(&fitted.turns, set, fitted.delay_secs(slot));
+                let view = fitted.evidence.views.iter().position(|view| view.slot == slot).ok_or(NoMask::NoFrame)?;
+                let (vertices, _) = body.at(view);
                 let gate = match &self.clothes {
-                    Clothes::Unknown => BodyGate::new(camera, &vertices, &self.surface.triangles),
+                    Clothes::Unknown => BodyGate::new(camera, vertices, &self.surface.triangles),
+                    Clothes::Known(dressed) if Arc::ptr_eq(dressed, &self.surface) => {
+                        BodyGate::new(camera, vertices, &dressed.triangles).map(BodyGate::of_known_clothes)
+                    }
                     Clothes::Known(dressed) => {
                         let (vertices, _) = self.skinned_in(dressed, &fitted.turns, set, fitted.delay_secs(slot));
                         BodyGate::new(camera, &vertices, &dressed.triangles).map(BodyGate::of_known_clothes)
@@ -30,37 +56,40 @@ impl PoseEstimator {
                 let gate = gate.ok_or(NoMask::OutOfView)?;
                 let inference = fitted.inferences[slot].as_ref();
                 let inference = inference.filter(|l| l.sighting.output.presence >= self.config.presence_threshold);
-                let light = self.background(slot).and_then(|known| known.light(picture, &|at| !gate.reaches_pixel(at)));
-                let evidence = light.as_ref().and_then(|light| light.evidence(picture, gate.bounds));
-                let mask = match (inference, &evidence) {
+                let known = self.background(slot);
+                let seen = known.and_then(|known| known.seen(picture, &gate));
+                let evidence = seen.as_ref().and_then(SeenBackground::evidence);
+                let mask = match (inference, evidence) {
                     (Some(inference), evidence) => {
-                        let coarse = match (&inference.body, &inference.sighting.output.mask) {
-                            (Some(body), Some(mask)) => {
+                        let crop = inference.sighting.crop;
+                        let coarse = match (&inference.sighting.output.mask, &inference.body) {
+                            (Some(mask), Some(body)) => {
                                 let (then, _) = self.skinned(&body.turns, set, fitted.delay_secs(slot));
-                                let (then, now) = (corners(camera, &then), corners(camera, &vertices));
-                                carried_mask(mask, inference.sighting.crop, &then, &now, gate.bounds)
+                                let (then, now) = (corners(camera, &then), corners(camera, vertices));
+                                carried_mask(mask, crop, &then, &now, gate.bounds)
                             }
-                            _ => coarse_mask(&inference.sighting, &gate),
+                            (Some(mask), None) => coarse_mask(mask, crop, &gate),
+                            (None, _) => body_mask(&gate),
                         };
-                        refine(picture, &coarse, inference.sighting.crop.scale(), &gate, evidence.as_ref())
+                        refine(picture, &coarse, crop.scale(), &gate, evidence)
                     }
                     // The network finds no person here, but the other cameras place the body in this image.
                     (None, Some(evidence))
-                        if light.is_some_and(|light| light.known_share(picture.width, gate.bounds) > MOSTLY_KNOWN) =>
+                        if known.is_some_and(|it| it.known_share(picture.width, gate.bounds) > MOSTLY_KNOWN) =>
                     {
                         gated_mask(evidence, &gate)
                     }
                     (None, _) => return Err(NoMask::NoPerson),
                 };
-                Ok((mask.ok_or(NoMask::Empty)?, gate))
+                Ok((mask.ok_or(NoMask::Empty)?, gate, seen))
             })
             .collect();
-        let (mut masks, mut gates) = (Vec::with_capacity(made.len()), Vec::with_capacity(made.len()));
-        for (view, made) in fitted.views.iter_mut().zip(made) {
+        let Masks { mut masks, mut gates, mut backgrounds } = Masks::none(made.len());
+        for (slot, (view, made)) in fitted.views.iter_mut().zip(made).enumerate() {
             view.no_mask = made.as_ref().err().copied();
-            let (mask, gate) = made.ok().unzip();
-            masks.push(mask);
-            gates.push(gate);
+            if let Ok((mask, gate, seen)) = made {
+                (masks[slot], gates[slot], backgrounds[slot]) = (Some(mask), Some(gate), seen);
+            }
         }
         if self.is_alone {
             drop_unsupported(&self.rig.cameras, &gates, &mut masks);
@@ -68,6 +97,14 @@ impl PoseEstimator {
         for ((view, mask), gate) in fitted.views.iter_mut().zip(&masks).zip(&gates) {
             view.mask_overlap = mask.as_ref().zip(gate.as_ref()).map(|(mask, gate)| gate.overlap(mask));
         }
-        masks
+        Masks { masks, gates, backgrounds }
+    }
+
+    /// Whether gates are drawn from the same surface as outlines are matched with.
+    pub(super) fn gates_show_surface(&self) -> bool {
+        match &self.clothes {
+            Clothes::Unknown => true,
+            Clothes::Known(dressed) => Arc::ptr_eq(dressed, &self.surface),
+        }
     }
 }

@@ -8,10 +8,10 @@ const OUTLINE_REACH_M: f64 = 0.05;
 const STEPS: usize = 4;
 
 /// World positions and normals of the template's vertices.
-type Skinned = (Vec<Vec3>, Vec<Vec3>);
+pub(super) type Skinned = (Vec<Vec3>, Vec<Vec3>);
 
 /// Body in a pose, at the frame set's time and at that of each view's image.
-struct PosedBody {
+pub(super) struct PosedBody {
     now: Skinned,
     /// Body at the time of each view of the fit; `None` where that is the frame set's time.
     own: Vec<Option<Skinned>>,
@@ -19,24 +19,24 @@ struct PosedBody {
 
 impl PosedBody {
     /// Returns the body at the time of a view.
-    fn at(&self, view: usize) -> &Skinned {
+    pub fn at(&self, view: usize) -> &Skinned {
         self.own[view].as_ref().unwrap_or(&self.now)
     }
 }
 
 impl PoseEstimator {
     /// Moves the pose so that the body's outline lies on that of the masks and its surface shows the remembered brightness;
-    /// the texture then learns from the images.
+    /// the texture then learns from the images. `body` is the body in the fitted pose, and `gates` where it is drawn.
     pub(super) fn refine(
         &self,
         set: &FrameSet,
         pictures: &[Option<Rgb<'_>>],
         fitted: &Fitted,
         masks: &[Option<&Mask>],
+        (mut body, mut gates): (PosedBody, &[Option<BodyGate>]),
         texture: &mut Texture,
     ) -> JointTurns {
         let mut turns = fitted.turns.clone();
-        let mut body = self.posed(set, fitted, &turns);
         let of_view = |view: &FitView| {
             let picture = pictures.get(view.slot).and_then(Option::as_ref);
             let camera = &self.rig.cameras[view.slot];
@@ -46,7 +46,7 @@ impl PoseEstimator {
         for round in 0..self.config.outline_rounds {
             // First with a wide reach, then with a narrow one.
             let last = round + 1 >= self.config.outline_rounds;
-            let mut lines = self.outline_points(fitted, &body, masks, if last { 1.0 } else { 2.0 });
+            let mut lines = self.outline_points(fitted, (&body, gates), masks, if last { 1.0 } else { 2.0 });
             lines.extend(self.texture_points(fitted, &body, texture, &images, usize::from(last)));
             if lines.is_empty() {
                 break;
@@ -57,7 +57,7 @@ impl PoseEstimator {
                 break;
             };
             turns = better;
-            body = self.posed(set, fitted, &turns);
+            (body, gates) = (self.posed(set, fitted, &turns), &[]);
         }
         for (index, (view, image)) in fitted.evidence.views.iter().zip(&images).enumerate() {
             if let Some(images) = image {
@@ -77,11 +77,11 @@ impl PoseEstimator {
         masks: &[Option<&Mask>],
         widen: f64,
     ) -> Vec<LinePoint> {
-        self.outline_points(fitted, &self.posed(set, fitted, turns), masks, widen)
+        self.outline_points(fitted, (&self.posed(set, fitted, turns), &[]), masks, widen)
     }
 
     /// Skins the body in a pose at the times of all views.
-    fn posed(&self, set: &FrameSet, fitted: &Fitted, turns: &JointTurns) -> PosedBody {
+    pub(super) fn posed(&self, set: &FrameSet, fitted: &Fitted, turns: &JointTurns) -> PosedBody {
         let own = |view: &FitView| {
             (view.delay_secs.abs() > MIN_DELAY_SECS).then(|| self.skinned(turns, set, view.delay_secs))
         };
@@ -114,8 +114,15 @@ impl PoseEstimator {
         fitted.evidence.views.par_iter().enumerate().flat_map_iter(of_view).collect()
     }
 
-    /// Matches the outline of the body with the masks of all views, within `widen` times [`OUTLINE_REACH_M`].
-    fn outline_points(&self, fitted: &Fitted, body: &PosedBody, masks: &[Option<&Mask>], widen: f64) -> Vec<LinePoint> {
+    /// Matches the outline of the body with the masks of all views, within `widen` times [`OUTLINE_REACH_M`]. Views with a
+    /// gate show the body there already.
+    fn outline_points(
+        &self,
+        fitted: &Fitted,
+        (body, gates): (&PosedBody, &[Option<BodyGate>]),
+        masks: &[Option<&Mask>],
+        widen: f64,
+    ) -> Vec<LinePoint> {
         let of_view = |(index, view): (usize, &FitView)| {
             let Some(mask) = masks.get(view.slot).copied().flatten() else { return Vec::new() };
             let (vertices, normals) = body.at(index);
@@ -126,6 +133,7 @@ impl PoseEstimator {
                 model: &self.model,
                 vertices,
                 normals,
+                gate: gates.get(view.slot).and_then(Option::as_ref),
             };
             let mut points = seen.match_mask(mask, index, widen * OUTLINE_REACH_M, widen * self.config.outline_sigma_m);
             shift(&mut points, body, index);

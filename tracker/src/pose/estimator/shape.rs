@@ -154,7 +154,8 @@ impl PoseEstimator {
                 continue;
             };
             fitted.turns = turns;
-            let masks = self.masks(set, &self.check(set)?, &mut fitted);
+            let body = self.posed(set, &fitted, &fitted.turns);
+            let masks = self.masks(set, &self.check(set)?, &mut fitted, &body).masks;
             found.push((set, fitted, masks));
         }
         // Most people wear shoes, and legs that reach down to the soles are too long.

@@ -5,7 +5,7 @@
 use std::{collections::BTreeMap, sync::Arc};
 
 use flyrig_body::skin_mesh;
-use flyrig_tracker::{Matte, matte};
+use flyrig_tracker::{Matte, SeenBackground, matte};
 use flyrig_types::{Frame, FrameSet, Mask};
 use rayon::prelude::*;
 
@@ -107,13 +107,15 @@ impl EstimatedPerception {
             for &index in seen {
                 let Ok(estimate) = &mut estimates[index] else { continue };
                 if let Some(mask) = estimate.masks.get_mut(slot).and_then(Option::take) {
-                    masks.push(((slot, index), frame, mask));
+                    let seen = estimate.backgrounds.get_mut(slot).and_then(Option::take);
+                    masks.push(((slot, index), frame, mask, seen));
                 }
             }
         }
-        let solve = |((slot, index), frame, mask): ((usize, usize), &Arc<Frame>, Mask)| {
+        type Made<'a> = ((usize, usize), &'a Arc<Frame>, Mask, Option<SeenBackground>);
+        let solve = |((slot, index), frame, mask, seen): Made<'_>| {
             let background = self.places[index].estimator.background(slot);
-            Ok(((slot, index), matte(&frame.image, &mask, background)?))
+            Ok(((slot, index), matte(&frame.image, &mask, background, seen.as_ref())?))
         };
         masks.into_par_iter().map(solve).collect()
     }
