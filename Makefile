@@ -2,6 +2,8 @@
 CARGO ?= cargo
 OUT ?= out/demo
 MINUTES ?= 30
+# Beginnings of the names of tests/tests/browser.rs: they need Chromium, and run one at a time.
+BROWSER_TESTS = a_browser_ a_page_ the_page_of_
 
 # Without a desktop Mesa's driver prints errors about a missing one.
 ifndef XDG_RUNTIME_DIR
@@ -13,7 +15,7 @@ endif
 help:
 	@echo "make demo    install what is missing, build, run the simulated rig, show the report (OUT=$(OUT))"
 	@echo "make test    install what is missing, build, run every test"
-	@echo "make test-long  the long stability runs"
+	@echo "make test-long  the long stability runs (90 minutes on two cores)"
 	@echo "make test-v4l2  camera capture against the kernel's test drivers, in an emulated machine"
 	@echo "make test-browser  the web page in Chromium, which it installs"
 	@echo "make soak    four plain cameras for MINUTES (30): memory, latency, processor time"
@@ -33,7 +35,7 @@ test: setup
 	$(CARGO) test --release --locked --workspace
 
 test-long: setup
-	$(CARGO) test --release --locked --workspace -- --ignored --nocapture
+	$(CARGO) test --release --locked --workspace -- --ignored --nocapture $(foreach test,$(BROWSER_TESTS),--skip $(test))
 
 test-v4l2: setup
 	@scripts/test-v4l2.sh

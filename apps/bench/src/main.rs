@@ -28,6 +28,7 @@ use crate::cli::{BenchCli, BenchCommand};
 fn main() -> ExitCode {
     // SAFETY: no other thread runs yet.
     unsafe { flyrig_transport::use_one_network_thread() };
+    flyrig_fusion::share_memory_pools();
     let cli = BenchCli::parse();
     program::start_log(cli.program.verbose, false);
     program::exit_code(traced(cli.program.trace.as_deref(), || dispatch(&cli)))

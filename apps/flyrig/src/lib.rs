@@ -90,6 +90,7 @@ pub fn main() -> ExitCode {
         flyrig_transport::use_one_network_thread();
         program::look_for_no_desktop();
     }
+    flyrig_fusion::share_memory_pools();
     let cli = Cli::from_arguments();
     program::start_log(cli.program.verbose, cli.log_json);
     if let Some(line) = cli.command.first_line() {

@@ -4,7 +4,7 @@ use std::{env, io::IsTerminal as _, process::ExitCode};
 
 use anyhow::Result;
 use flyrig_gpu::{AdapterChoice, GpuContext};
-use flyrig_types::{escape_controls, shorten_values};
+use flyrig_types::{escape_controls, shorten_values, shortened, wrong_vectors_limit};
 use tracing_subscriber::EnvFilter;
 
 /// Opens the graphics adapter with this text in its name, or the fastest one.
@@ -62,6 +62,9 @@ pub fn start_log(verbose: u8, json: bool) {
         builder.json().init();
     } else {
         builder.with_target(false).init();
+    }
+    if let Some(wrong) = wrong_vectors_limit() {
+        tracing::warn!("FLYRIG_VECTORS is \"{}\", expected \"avx2\" or \"none\"; it limits nothing", shortened(&wrong));
     }
 }
 

@@ -26,29 +26,44 @@ pub(crate) fn eliminate(points: &[Vec3], normals: &[Vec3], keep: usize, area: f6
     let r_min = r_max * (1.0 - (keep as f32 / points.len() as f32).powf(GAMMA)) * BETA;
     let weight = |distance: f32| (1.0 - distance.max(2.0 * r_min) / (2.0 * r_max)).max(0.0).powi(ALPHA);
 
-    let grid = PointGrid::new(points, 2.0 * r_max);
-    let neighbors: Vec<Vec<(u32, f32)>> = points
-        .par_iter()
-        .enumerate()
-        .map(|(i, &point)| {
-            let mut list = Vec::new();
-            grid.within(point, 2.0 * r_max, |j, squared| {
-                if j != i && normals[i].dot(normals[j]) > 0.0 {
-                    list.push((j as u32, weight(squared.sqrt())));
-                }
-            });
-            list
+    // By place in the grid, so that neighbours lie beside each other in memory.
+    let order = PointGrid::new(points, 2.0 * r_max).order();
+    let placed: Vec<Vec3> = order.iter().map(|&index| points[index as usize]).collect();
+    let normals: Vec<Vec3> = order.iter().map(|&index| normals[index as usize]).collect();
+    let grid = PointGrid::new(&placed, 2.0 * r_max);
+    let starts: Vec<usize> = (0..placed.len()).step_by(POINTS_A_TASK).collect();
+    let neighbors: Vec<Neighbors> = starts
+        .into_par_iter()
+        .map(|start| {
+            let mut found = Neighbors::default();
+            for i in start..(start + POINTS_A_TASK).min(placed.len()) {
+                let mut sum = 0.0;
+                grid.within(placed[i], 2.0 * r_max, |j, squared| {
+                    if j != i && normals[i].dot(normals[j]) > 0.0 {
+                        found.list.push(j as u32);
+                        sum += weight(squared.sqrt());
+                    }
+                });
+                found.ends.push(found.list.len());
+                found.weights.push(sum);
+            }
+            found
         })
         .collect();
-    let mut weights: Vec<f32> = neighbors.iter().map(|list| list.iter().map(|(_, w)| w).sum()).collect();
-    let mut heap: BinaryHeap<u64> = weights.iter().enumerate().map(|(index, weight)| entry(*weight, index)).collect();
+    let of_point = |place: usize| neighbors[place / POINTS_A_TASK].of(place % POINTS_A_TASK);
+    let mut weights: Vec<f32> = neighbors.iter().flat_map(|found| &found.weights).copied().collect();
+    let mut places = vec![0u32; points.len()];
+    order.iter().enumerate().for_each(|(place, &index)| places[index as usize] = place as u32);
+    let mut heap: BinaryHeap<u64> =
+        places.iter().enumerate().map(|(index, &place)| entry(weights[place as usize], index)).collect();
     let mut alive = vec![true; points.len()];
     let mut left = points.len();
     while left > keep {
         let Some(mut highest) = heap.peek_mut() else { break };
         let index = (u32::MAX - *highest as u32) as usize;
+        let place = places[index] as usize;
         // Weights only fall: an outdated entry is too high and sinks to its place.
-        let now = entry(weights[index], index);
+        let now = entry(weights[place], index);
         if *highest > now {
             *highest = now;
             continue;
@@ -56,11 +71,33 @@ pub(crate) fn eliminate(points: &[Vec3], normals: &[Vec3], keep: usize, area: f6
         PeekMut::pop(highest);
         alive[index] = false;
         left -= 1;
-        for &(neighbor, w) in &neighbors[index] {
-            weights[neighbor as usize] -= w;
+        for &neighbor in of_point(place) {
+            let neighbor = neighbor as usize;
+            weights[neighbor] -= weight(placed[place].distance_squared(placed[neighbor]).sqrt());
         }
     }
     (0..points.len()).filter(|&i| alive[i]).collect()
+}
+
+/// Points whose neighbours are found by one parallel task, in one list: a list for each point would leave the memory in pieces.
+const POINTS_A_TASK: usize = 4096;
+
+/// Neighbours of consecutive points. The weights by which they repel each other are computed again where they are needed: stored, they
+/// would take most of the memory.
+#[derive(Default)]
+struct Neighbors {
+    /// End of each point's neighbours in `list`.
+    ends: Vec<usize>,
+    list: Vec<u32>,
+    /// Sum of the weights of each point's neighbours.
+    weights: Vec<f32>,
+}
+
+impl Neighbors {
+    fn of(&self, point: usize) -> &[u32] {
+        let start = if point == 0 { 0 } else { self.ends[point - 1] };
+        &self.list[start..self.ends[point]]
+    }
 }
 
 /// Returns the entry of a point in the heap, the highest first: its weight, then the lower index. One number is compared

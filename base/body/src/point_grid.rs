@@ -4,6 +4,8 @@ use glam::{IVec3, Vec3};
 
 /// Largest number of cells; more would cost more memory than they save time.
 const MAX_CELLS: f64 = 16e6;
+/// Cells of a row that share an entry in the table of first points: most cells are empty, and queries test distances anyway.
+const CELLS_A_BLOCK: i32 = 4;
 
 /// Finite points sorted into cubes, for queries of neighbours.
 ///
@@ -23,9 +25,9 @@ pub struct PointGrid {
     origin: Vec3,
     cell: f32,
     size: IVec3,
-    /// First point of each cell in `sorted`; one element more than cells.
+    /// First point of each block of cells in `sorted`; one element more than blocks.
     starts: Vec<u32>,
-    /// Index and place of each point, by cells.
+    /// Index and place of each point, by cells and then by index.
     sorted: Vec<(u32, Vec3)>,
 }
 
@@ -44,29 +46,40 @@ impl PointGrid {
         let size = (extent / cell).as_ivec3() + IVec3::ONE;
         let mut grid =
             Self { origin: min, cell, size, starts: Vec::new(), sorted: vec![(0, Vec3::ZERO); points.len()] };
-        let mut starts = vec![0u32; size.element_product() as usize + 1];
+        let blocks = IVec3::new((size.x - 1) / CELLS_A_BLOCK + 1, size.y, size.z).element_product() as usize;
+        let mut starts = vec![0u32; blocks + 1];
         for &point in points {
-            starts[grid.index(grid.cell_of(point)) + 1] += 1;
+            starts[grid.block(grid.cell_of(point)) + 1] += 1;
         }
         for i in 1..starts.len() {
             starts[i] += starts[i - 1];
         }
         let mut next = starts.clone();
         for (i, &point) in points.iter().enumerate() {
-            let slot = &mut next[grid.index(grid.cell_of(point))];
+            let slot = &mut next[grid.block(grid.cell_of(point))];
             grid.sorted[*slot as usize] = (i as u32, point);
             *slot += 1;
         }
-        grid.starts = starts;
-        grid
+        let mut sorted = std::mem::take(&mut grid.sorted);
+        for block in starts.windows(2).filter(|block| block[1] > block[0] + 1) {
+            sorted[block[0] as usize..block[1] as usize].sort_by_key(|(_, point)| grid.cell_of(*point).x);
+        }
+        Self { starts, sorted, ..grid }
+    }
+
+    /// Returns the indices of the points in the order in which queries visit them: neighbours in space are mostly neighbours.
+    #[must_use]
+    pub fn order(&self) -> Vec<u32> {
+        self.sorted.iter().map(|(index, _)| *index).collect()
     }
 
     fn cell_of(&self, point: Vec3) -> IVec3 {
         ((point - self.origin) / self.cell).floor().as_ivec3().clamp(IVec3::ZERO, self.size - 1)
     }
 
-    fn index(&self, cell: IVec3) -> usize {
-        ((cell.z * self.size.y + cell.y) * self.size.x + cell.x) as usize
+    fn block(&self, cell: IVec3) -> usize {
+        let in_row = (self.size.x - 1) / CELLS_A_BLOCK + 1;
+        ((cell.z * self.size.y + cell.y) * in_row + cell.x / CELLS_A_BLOCK) as usize
     }
 
     /// Calls `visit(index, squared distance)` for each point within `radius`, in a fixed order.
@@ -75,9 +88,9 @@ impl PointGrid {
         let high = self.cell_of(centre + radius);
         for z in low.z..=high.z {
             for y in low.y..=high.y {
-                // Cells of a row lie side by side.
-                let first = self.starts[self.index(IVec3::new(low.x, y, z))] as usize;
-                let last = self.starts[self.index(IVec3::new(high.x, y, z)) + 1] as usize;
+                // Blocks of a row lie side by side.
+                let first = self.starts[self.block(IVec3::new(low.x, y, z))] as usize;
+                let last = self.starts[self.block(IVec3::new(high.x, y, z)) + 1] as usize;
                 for &(i, point) in &self.sorted[first..last] {
                     let squared = point.distance_squared(centre);
                     if squared <= radius * radius {

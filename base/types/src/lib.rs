@@ -28,6 +28,7 @@ mod restarts;
 mod seconds;
 mod supervised;
 mod text_file;
+mod vectors;
 mod whole_file;
 
 pub use camera::{Camera, CameraError, Intrinsics, Lens, MAX_IMAGE_SIDE, Rig};
@@ -47,4 +48,5 @@ pub use restarts::Restarts;
 pub use seconds::{deadline_after, saturating_secs};
 pub use supervised::{SupervisedThread, ThreadHealth, ThreadWatch};
 pub use text_file::{decode_text, read_text, read_text_up_to};
+pub use vectors::{vectorized, wrong_vectors_limit};
 pub use whole_file::write_whole;

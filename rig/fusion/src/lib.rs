@@ -47,7 +47,7 @@ pub use deformation::{DeformOptions, PAPER_COLOR_WEIGHT};
 pub use error::FusionError;
 pub use health::{
     CameraHealth, Health, STUCK_AFTER, StageSummary, StageTimes, TracedStage, check_threads, processor_time,
-    resident_mib, start_stage_trace, take_stage_trace,
+    resident_mib, share_memory_pools, start_stage_trace, take_stage_trace,
 };
 pub use intake::{InputFormat, Intake, SetReader, next_frame};
 pub use live::{Correction, LiveRig, LiveStep, RigWatch, WatchEvent};

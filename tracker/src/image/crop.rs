@@ -79,7 +79,7 @@ impl Crop {
     /// Samples a crop of `net_side` x `net_side` pixels: RGB in 0..=1, row by row, black outside the image. Each value
     /// averages enough samples that a large crop does not alias.
     pub fn sample_square(&self, picture: &Rgb, net_side: usize) -> Vec<f32> {
-        pulp::Arch::new().dispatch(Sampling { crop: *self, picture, net_side })
+        flyrig_types::vectorized(Sampling { crop: *self, picture, net_side })
     }
 
     /// Returns the network's landmarks in pixels of the image.

@@ -30,13 +30,13 @@ impl Grid {
     /// unplaced vertex are ignored. Places are pixels, centres at integers.
     pub fn fill_mesh(&mut self, places: &[Option<DVec2>], triangles: &[[u32; 3]]) {
         if !self.values.is_empty() {
-            pulp::Arch::new().dispatch(FillMesh { grid: self, places, triangles });
+            flyrig_types::vectorized(FillMesh { grid: self, places, triangles });
         }
     }
 
     /// Returns the chamfer distance of each pixel (weights 3 and 4, over 3) to the nearest one above one half, pixels.
     pub fn distance_to_set(&self) -> Self {
-        pulp::Arch::new().dispatch(Distances(self))
+        flyrig_types::vectorized(Distances(self))
     }
 
     /// Returns the mean over a square of `2 radius + 1` pixels around each pixel, cut off at the border.
@@ -44,7 +44,7 @@ impl Grid {
         if self.values.is_empty() {
             return self.clone();
         }
-        pulp::Arch::new().dispatch(BoxMean(self, radius))
+        flyrig_types::vectorized(BoxMean(self, radius))
     }
 
     /// Smooths along the edges of `guide` by the guided filter (He et al. 2010) with a window of `2 radius + 1` pixels and

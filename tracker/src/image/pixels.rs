@@ -90,27 +90,30 @@ impl<'a> Rgb<'a> {
         // Positive where `as` rounds down: one more than the column and row of the upper left pixel.
         let (right, below) = ((at.x + 1.0) as usize, (at.y + 1.0) as usize);
         let (fx, fy) = ((at.x + 1.0 - right as f64) as f32, (at.y + 1.0 - below as f64) as f32);
-        let mix = |a: [f32; 3], b: [f32; 3], c: [f32; 3], d: [f32; 3]| {
-            std::array::from_fn(|k| {
+        // Four channels fill a vector register; the last one is of the next pixel, or nothing, and dropped.
+        let mix = |[a, b, c, d]: [[f32; 4]; 4]| -> [f32; 3] {
+            let mixed: [f32; 4] = std::array::from_fn(|k| {
                 let top = a[k] + (b[k] - a[k]) * fx;
                 let bottom = c[k] + (d[k] - c[k]) * fx;
                 top + (bottom - top) * fy
-            })
+            });
+            [mixed[0], mixed[1], mixed[2]]
         };
         if right > 0 && below > 0 && right < self.width && below < self.height {
             // Two pixels of two rows, all inside.
-            let row = |y: usize| self.bytes[(y * self.width + right - 1) * 3..].first_chunk::<6>();
+            let row = |y: usize| self.bytes[(y * self.width + right - 1) * 3..].first_chunk::<7>();
             if let (Some(top), Some(bottom)) = (row(below - 1), row(below)) {
-                let pixel = |row: &[u8; 6], at: usize| [row[at], row[at + 1], row[at + 2]].map(f32::from);
-                return mix(pixel(top, 0), pixel(top, 3), pixel(bottom, 0), pixel(bottom, 3));
+                let pixel = |row: &[u8; 7], at: usize| [row[at], row[at + 1], row[at + 2], row[at + 3]].map(f32::from);
+                return mix([pixel(top, 0), pixel(top, 3), pixel(bottom, 0), pixel(bottom, 3)]);
             }
         }
-        let fetch = |dx: usize, dy: usize| -> [f32; 3] {
+        let fetch = |dx: usize, dy: usize| -> [f32; 4] {
             let (x, y) = (right + dx, below + dy);
             let is_inside = x > 0 && y > 0 && x <= self.width && y <= self.height;
-            if is_inside { self.pixel(x - 1, y - 1).map(f32::from) } else { [0.0; 3] }
+            let [r, g, b] = if is_inside { self.pixel(x - 1, y - 1).map(f32::from) } else { [0.0; 3] };
+            [r, g, b, 0.0]
         };
-        mix(fetch(0, 0), fetch(1, 0), fetch(0, 1), fetch(1, 1))
+        mix([fetch(0, 0), fetch(1, 0), fetch(0, 1), fetch(1, 1)])
     }
 }
 

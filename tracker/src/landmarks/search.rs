@@ -165,13 +165,13 @@ impl ViewSearch {
         taken: &[[Option<DVec2>; LANDMARK_COUNT]],
         nanos: i64,
     ) -> Result<(), TrackError> {
-        let mut sighting = Sighting::infer(net, picture, crop, false)?;
+        let mut sighting = Sighting::infer(net, picture, crop)?;
         if sighting.output.presence < 0.5 * config.presence_threshold {
             return Ok(());
         }
         for _ in 0..2 {
             let Some(crop) = sighting.next_crop() else { break };
-            sighting = Sighting::infer(net, picture, crop, false)?;
+            sighting = Sighting::infer(net, picture, crop)?;
         }
         if sighting.output.presence < config.presence_threshold || taken.iter().any(|marks| sighting.shows(marks)) {
             return Ok(());

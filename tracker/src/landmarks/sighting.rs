@@ -19,12 +19,12 @@ pub(crate) struct Sighting {
 }
 
 impl Sighting {
-    /// Runs the network on a crop, with or without its mask.
+    /// Runs the network on a crop.
     ///
     /// # Errors
     /// Kind `Net` when the network fails.
-    pub fn infer(net: &PoseNet, picture: &Rgb, crop: Crop, with_mask: bool) -> Result<Self, TrackError> {
-        let output = net.infer(picture, crop, with_mask)?;
+    pub fn infer(net: &PoseNet, picture: &Rgb, crop: Crop) -> Result<Self, TrackError> {
+        let output = net.infer(picture, crop)?;
         let keypoints = crop.keypoints(&output);
         Ok(Self { crop, output, keypoints })
     }

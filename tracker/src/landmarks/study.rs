@@ -84,7 +84,7 @@ impl LandmarkStudy {
         let Some(turns) = model.to_turns(pose) else { return Ok(()) };
         let (posed, marks) = (model.pose(&turns), model.marks(&turns));
         let Some(crop) = Crop::around(&project_all(camera, &marks)) else { return Ok(()) };
-        let sighting = Sighting::infer(&self.net, &Rgb::new(image)?, crop, false)?;
+        let sighting = Sighting::infer(&self.net, &Rgb::new(image)?, crop)?;
         if sighting.output.presence < 0.5 {
             return Ok(());
         }

@@ -24,7 +24,7 @@ pub(crate) fn plate_evidence(picture: &Rgb, plate: &[f32], drift: &Drift, bounds
     let mut grid = Grid::new(x1 - x0, y1 - y0, 0.0);
     grid.rows_mut().for_each(|(y, values)| {
         let row = 3 * ((y + y0) * picture.width + x0)..3 * ((y + y0) * picture.width + x1);
-        pulp::Arch::new().dispatch(Row { now: &picture.bytes[row.clone()], plate: &plate[row], drift, values });
+        flyrig_types::vectorized(Row { now: &picture.bytes[row.clone()], plate: &plate[row], drift, values });
     });
     Some(grid)
 }

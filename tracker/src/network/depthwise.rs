@@ -279,7 +279,7 @@ impl Depthwise {
         let range = self.range()?;
         let (geometry, total) = (&self.geometry, output.len());
         par_chunks_mut(output, geometry.output.iter().product(), total, |first, output| {
-            pulp::Arch::new().dispatch(Filter { geometry, input, kernels, biases, range, first, output });
+            flyrig_types::vectorized(Filter { geometry, input, kernels, biases, range, first, output });
             Ok(())
         })
     }

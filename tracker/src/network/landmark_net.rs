@@ -79,7 +79,6 @@ impl LandmarkNet {
 }
 
 /// Network that was read from its file and can be made ready to run, whole or in part.
-#[derive(Clone)]
 pub(crate) struct LoadedNet {
     model: TypedModel,
     shape: [usize; 4],

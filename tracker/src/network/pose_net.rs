@@ -29,12 +29,7 @@ pub struct PoseNet {
 
 #[derive(Clone)]
 enum Kind {
-    BlazePose {
-        /// All outputs.
-        whole: LandmarkNet,
-        /// Without the mask, whose branch is a quarter of the work.
-        without_mask: LandmarkNet,
-    },
+    BlazePose { net: LandmarkNet, has_mask: bool },
     Chosen(Box<ChosenNet>),
 }
 
@@ -58,11 +53,22 @@ impl PoseNet {
     /// # Errors
     /// Kind [`crate::TrackErrorKind::Net`] when the file does not load or has other inputs or outputs.
     pub fn from_onnx(bytes: &[u8]) -> Result<Self, TrackError> {
-        let loaded = LoadedNet::of_crops(bytes, NET_SIDE, "pose")?;
-        let without_mask = loaded.clone().without_output(MASK_SIZE)?.runnable()?;
-        let whole = loaded.runnable()?;
-        run_blazepose(&whole, &whole.blank(), true)?;
-        Ok(Self { kind: Kind::BlazePose { whole, without_mask } })
+        Self::checked(LoadedNet::of_crops(bytes, NET_SIDE, "pose")?, true)
+    }
+
+    /// Loads the network built into this crate without its mask, whose branch is a quarter of the work.
+    ///
+    /// # Errors
+    /// Those of [`Self::embedded`].
+    pub fn embedded_without_mask() -> Result<Self, TrackError> {
+        let loaded = LoadedNet::of_crops(EMBEDDED, NET_SIDE, "pose")?;
+        Self::checked(loaded.without_output(MASK_SIZE)?, false)
+    }
+
+    fn checked(loaded: LoadedNet, has_mask: bool) -> Result<Self, TrackError> {
+        let net = loaded.runnable()?;
+        run_blazepose(&net, &net.blank(), has_mask)?;
+        Ok(Self { kind: Kind::BlazePose { net, has_mask } })
     }
 
     /// Loads a network of the user's choice from a TOML file that describes it (docs/guide/people.md).
@@ -73,35 +79,32 @@ impl PoseNet {
         Ok(Self { kind: Kind::Chosen(Box::new(ChosenNet::read(path)?)) })
     }
 
-    /// Whether outputs hold a mask and the depth of landmarks.
+    /// Whether outputs hold the depth of landmarks.
     #[must_use]
     pub fn sees_depth(&self) -> bool {
         matches!(self.kind, Kind::BlazePose { .. })
     }
 
-    /// Runs the network on a square of an image. Without `with_mask`, the output holds none, and takes less time.
+    /// Runs the network on a square of an image.
     ///
     /// # Errors
     /// Kind [`crate::TrackErrorKind::Net`] when the network fails, or an output is missing or not finite.
-    pub(crate) fn infer(&self, picture: &Rgb, crop: Crop, with_mask: bool) -> Result<NetOutput, TrackError> {
+    pub(crate) fn infer(&self, picture: &Rgb, crop: Crop) -> Result<NetOutput, TrackError> {
         match &self.kind {
-            Kind::BlazePose { whole, without_mask } => {
-                let net = if with_mask { whole } else { without_mask };
-                run_blazepose(net, &crop.sample(picture), with_mask)
-            }
+            Kind::BlazePose { net, has_mask } => run_blazepose(net, &crop.sample(picture), *has_mask),
             Kind::Chosen(net) => net.infer(picture, crop),
         }
     }
 }
 
 /// Runs BlazePose on a crop of 256 x 256 x 3 values, RGB in 0..=1, row by row.
-fn run_blazepose(net: &LandmarkNet, rgb: &[f32], with_mask: bool) -> Result<NetOutput, TrackError> {
+fn run_blazepose(net: &LandmarkNet, rgb: &[f32], has_mask: bool) -> Result<NetOutput, TrackError> {
     let outputs = net.run(rgb)?;
     let find = |count| outputs.of_size(count);
     let raw = find(NET_LANDMARKS * LANDMARK_STRIDE)?;
     let world = find(NET_LANDMARKS * 3)?;
     let presence = f64::from(find(1)?[0]).clamp(0.0, 1.0);
-    let logits = with_mask.then(|| find(MASK_SIZE)).transpose()?;
+    let logits = has_mask.then(|| find(MASK_SIZE)).transpose()?;
     let mask = logits.map(|logits| logits.into_iter().map(|logit| 1.0 / (1.0 + (-logit).exp())).collect());
     let mut landmarks = [CropLandmark::default(); LANDMARK_COUNT];
     for (i, landmark) in landmarks.iter_mut().enumerate() {
@@ -133,8 +136,8 @@ mod tests {
     #[test]
     fn the_embedded_network_sees_nobody_in_grey_and_refuses_a_wrong_size() {
         let net = PoseNet::embedded().unwrap();
-        let output = net.infer(&grey(), whole(), true).unwrap();
-        let without = net.infer(&grey(), whole(), false).unwrap();
+        let output = net.infer(&grey(), whole()).unwrap();
+        let without = PoseNet::embedded_without_mask().unwrap().infer(&grey(), whole()).unwrap();
         assert!(
             without.mask.is_none() && without.landmarks == output.landmarks,
             "the mask's branch changes nothing else"
@@ -143,15 +146,15 @@ mod tests {
         let mask = output.mask.unwrap();
         assert_eq!(mask.len(), NET_SIDE * NET_SIDE);
         assert!(mask.iter().all(|p| (0.0..=1.0).contains(p)));
-        let Kind::BlazePose { whole, .. } = net.kind else { panic!("the embedded network is BlazePose") };
-        assert_eq!(run_blazepose(&whole, &[0.5; 12], true).unwrap_err().kind, TrackErrorKind::Net);
+        let Kind::BlazePose { net, .. } = net.kind else { panic!("the embedded network is BlazePose") };
+        assert_eq!(run_blazepose(&net, &[0.5; 12], true).unwrap_err().kind, TrackErrorKind::Net);
     }
 
     #[test]
     fn runs_from_many_threads_and_from_rayons_own_do_not_meet() {
         use rayon::prelude::*;
         let net = PoseNet::embedded().unwrap();
-        let run = |_| net.infer(&grey(), whole(), true).unwrap().presence.to_bits();
+        let run = |_| net.infer(&grey(), whole()).unwrap().presence.to_bits();
         let expected = run(0);
         std::thread::scope(|scope| {
             for thread in 0..4 {

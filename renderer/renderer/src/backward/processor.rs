@@ -17,7 +17,7 @@ use crate::backward::target::GradientTarget;
 use crate::buffers::{GaussianBuffers, RenderTarget};
 use crate::raster::kernels::{MAX_ALPHA, OPAQUE};
 use crate::raster::processor::blend::{LOG2_CUT, TileLanes, exponents, is_opaque, rows_of};
-use crate::raster::processor::lanes::{LANES, Lanes, exp2, sum, vectorized};
+use crate::raster::processor::lanes::{LANES, Lanes, exp2, sum};
 use crate::raster::processor::project::{ProjectedSplat, TILE};
 use crate::raster::processor::rasterizer::{ProcessorRasterizer, RasterImage};
 use crate::raster::processor::shape::Shape;
@@ -103,7 +103,7 @@ impl ProcessorBackward {
                     }
                     let Some(state) = pixels.state(column, row) else { continue };
                     let range = lists.range(row * columns + column);
-                    *walked = vectorized(TileBackward {
+                    *walked = flyrig_types::vectorized(TileBackward {
                         state,
                         origin: [(column * LANES) as f32, (row * ROWS) as f32],
                         list: &lists.pairs[range.clone()],

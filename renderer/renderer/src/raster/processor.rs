@@ -5,7 +5,7 @@
 //! runs in a fixed order: equal input gives equal bytes, whatever the number of threads.
 //!
 //! A tile's pixels are blended eight at a time by plain loops over arrays of eight, compiled for each generation of vector
-//! instructions; [`vectorized`] picks the one that the processor has.
+//! instructions; [`flyrig_types::vectorized`] picks the one that the processor has.
 
 #![allow(clippy::needless_range_loop)] // one index for several lanes is what compilers turn into vectors
 

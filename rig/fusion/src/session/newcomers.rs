@@ -10,7 +10,9 @@ use flyrig_gpu::GpuContext;
 use flyrig_types::{PersonId, Rig};
 
 use super::perceiver::Newcomer;
-use crate::{error::FusionError, settings::session::SessionSettings, subject::person::Subject};
+use crate::{
+    error::FusionError, health::release_free_memory, settings::session::SessionSettings, subject::person::Subject,
+};
 
 /// Name of the threads, in errors.
 const NAME: &str = "new person";
@@ -92,5 +94,7 @@ fn prepare(
 ) -> Result<Subject, FusionError> {
     let mut subject = Subject::new(gpu, person, worn, rig, settings)?;
     subject.shape_number = shape;
+    // The choice of evenly spaced points needs far more memory than its result.
+    release_free_memory();
     Ok(subject)
 }

@@ -106,7 +106,7 @@ impl PoseEstimator {
             let camera = &self.rig.cameras[slot];
             let expected = project_all(camera, predicted);
             let Some(crop) = Crop::around(&expected) else { return Ok(None) };
-            let sighting = Sighting::infer(&self.net, picture, crop, self.config.masks)?;
+            let sighting = Sighting::infer(&self.net, picture, crop)?;
             // Two people in one crop: the network may have chosen the other one.
             let own = sighting.mean_distance(&expected).unwrap_or(f64::INFINITY);
             let is_other = |marks| sighting.mean_distance(&project_all(camera, marks)).is_some_and(|d| d < own);

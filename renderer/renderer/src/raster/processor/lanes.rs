@@ -8,13 +8,6 @@ pub(crate) const LANES: usize = 8;
 /// One number per pixel.
 pub(crate) type Lanes = [f32; LANES];
 
-/// Runs `work` compiled for the best vector instructions that the processor has. The work must be inlined into the call
-/// to benefit from them.
-#[inline]
-pub(crate) fn vectorized<W: pulp::NullaryFnOnce>(work: W) -> W::Output {
-    pulp::Arch::new().dispatch(work)
-}
-
 /// Computes 2^x for x from -100 to 100, with a relative error of 2e-7; below, 2^-100.
 ///
 /// Uses no multiply-add: it rounds once on processors that have it and twice on others, so that equal input would give

@@ -6,7 +6,6 @@ use rayon::prelude::*;
 
 use crate::anisotropic::harmonics::Harmonics;
 use crate::raster::buffers::pair_capacity;
-use crate::raster::processor::lanes::vectorized;
 use crate::raster::processor::project::{ProjectedSplat, Projection, Rect, TILE};
 
 /// Gaussians per projection task.
@@ -133,7 +132,7 @@ impl Lists {
         let chunks = self.splats.par_chunks_mut(CHUNK).zip(&mut self.visible);
         chunks.enumerate().for_each(|(chunk, (splats, visible))| {
             visible.clear();
-            vectorized(ProjectChunk { projection, gaussians, first: chunk * CHUNK, splats, visible });
+            flyrig_types::vectorized(ProjectChunk { projection, gaussians, first: chunk * CHUNK, splats, visible });
         });
     }
 

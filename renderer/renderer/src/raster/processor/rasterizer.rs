@@ -11,7 +11,7 @@ use crate::anisotropic::harmonics::Harmonics;
 use crate::anisotropic::order::HarmonicOrder;
 use crate::buffers::RenderTarget;
 use crate::raster::processor::blend::{BlendTile, BlendedTile};
-use crate::raster::processor::lanes::{LANES, vectorized};
+use crate::raster::processor::lanes::LANES;
 use crate::raster::processor::lists::{Anisotropic, Isotropic, Lists};
 use crate::raster::processor::project::{Projection, TILE};
 use crate::raster::settings::{Latest, tile_range};
@@ -123,7 +123,7 @@ impl ProcessorRasterizer {
                     band.clear(size[0] as usize, left);
                     continue;
                 }
-                let tile = vectorized(BlendTile {
+                let tile = flyrig_types::vectorized(BlendTile {
                     origin: [(column * TILE) as f32, (row * TILE) as f32],
                     list,
                     splats: &lists.splats,

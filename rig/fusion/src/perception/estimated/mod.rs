@@ -288,7 +288,8 @@ impl Perception for EstimatedPerception {
 /// Loads the landmark network of the settings.
 fn network(settings: &PerceptionSettings, rig: &Rig) -> Result<PoseNet, FusionError> {
     if settings.network.as_os_str().is_empty() {
-        return Ok(PoseNet::embedded()?);
+        let is_masked = settings.masks == Origin::Estimated;
+        return Ok(if is_masked { PoseNet::embedded() } else { PoseNet::embedded_without_mask() }?);
     }
     let network = PoseNet::from_description(&settings.network)?;
     if rig.cameras.len() < 2 && !network.sees_depth() {
