@@ -114,7 +114,7 @@ impl pulp::NullaryFnOnce for FillMesh<'_> {
             let (first, last) = (low.ceil().max(DVec2::ZERO), (high.floor() + 1.0).min(end));
             let (columns, rows) = (first.x as usize..last.x as usize, first.y as usize..last.y as usize);
             // Most triangles of a body lie between the centres of pixels, or behind others that are filled.
-            let is_full = |y: usize| values[y * width..][columns.clone()].iter().all(|value| *value == 1.0);
+            let is_full = |y: usize| values[y * width..][columns.clone()].iter().all(|value| *value > 0.5);
             if columns.is_empty() || rows.clone().all(is_full) {
                 continue;
             }

@@ -8,6 +8,9 @@ use super::*;
 use crate::masks::background_light::MOSTLY_KNOWN;
 use crate::masks::support::drop_unsupported;
 
+/// Mask of one view and what it was made of.
+type Made = (Mask, BodyGate, Option<SeenBackground>);
+
 /// Masks of one frame set and what they were made of, in rig order.
 pub(super) struct Masks {
     pub masks: Vec<Option<Mask>>,
@@ -35,7 +38,7 @@ impl PoseEstimator {
         if !self.config.masks {
             return Masks::none(pictures.len());
         }
-        let made: Vec<Result<(Mask, BodyGate, Option<SeenBackground>), NoMask>> = pictures
+        let made: Vec<Result<Made, NoMask>> = pictures
             .par_iter()
             .enumerate()
             .map(|(slot, picture)| {
