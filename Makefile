@@ -15,7 +15,7 @@ endif
 help:
 	@echo "make demo    install what is missing, build, run the simulated rig, show the report (OUT=$(OUT))"
 	@echo "make test    install what is missing, build, run every test"
-	@echo "make test-long  the long stability runs (90 minutes on two cores)"
+	@echo "make test-long  the long stability runs (an hour on two cores)"
 	@echo "make test-v4l2  camera capture against the kernel's test drivers, in an emulated machine"
 	@echo "make test-browser  the web page in Chromium, which it installs"
 	@echo "make soak    four plain cameras for MINUTES (30): memory, latency, processor time"
