@@ -107,3 +107,37 @@ fn entry(weight: f32, index: usize) -> u64 {
     let ordered = if bits >> 31 == 0 { bits | 1 << 31 } else { !bits };
     u64::from(ordered) << 32 | u64::from(u32::MAX - index as u32)
 }
+
+#[cfg(test)]
+mod tests {
+    use rand::{RngExt, SeedableRng};
+
+    use super::*;
+
+    #[test]
+    fn the_heaviest_point_comes_first_then_the_lowest_index() {
+        let weights = [-2.0f32, -1e-9, -0.0, 0.0, 1e-9, 0.5, 3.0];
+        for (a, b) in weights.into_iter().flat_map(|a| weights.map(|b| (a, b))) {
+            assert_eq!(entry(a, 7).cmp(&entry(b, 7)), a.total_cmp(&b), "{a} {b}");
+            assert!(entry(a, 3) > entry(a, 4) && entry(a, 0) as u32 == u32::MAX);
+        }
+    }
+
+    #[test]
+    fn points_of_several_tasks_stay_apart_and_sheets_do_not_repel() {
+        let mut rng = rand::rngs::StdRng::seed_from_u64(5);
+        let (count, keep) = (POINTS_A_TASK + 1904, 600);
+        let points: Vec<Vec3> = (0..count).map(|_| Vec3::new(rng.random(), rng.random(), 0.0)).collect();
+        let kept = eliminate(&points, &vec![Vec3::Z; count], keep, 1.0);
+        assert!(kept.len() == keep && kept.is_sorted_by(|a, b| a < b));
+        let packed = 2.0 * (1.0 / (2.0 * 3.0f32.sqrt() * keep as f32)).sqrt();
+        let pairs = kept.iter().flat_map(|a| kept.iter().filter(move |b| *b > a).map(move |b| (a, b)));
+        let least = pairs.map(|(a, b)| points[*a].distance(points[*b])).fold(f32::INFINITY, f32::min);
+        assert!(least > 0.6 * packed, "{least} of {packed}");
+        // The same place on two sheets: neither point repels the other.
+        let normals = [Vec3::Z, -Vec3::Z, Vec3::Z];
+        let twice = [Vec3::ZERO, Vec3::ZERO, Vec3::X * 1e-3];
+        assert!(eliminate(&twice, &normals, 2, 1.0).contains(&1));
+        assert!(eliminate(&[], &[], 0, 1.0).is_empty());
+    }
+}

@@ -27,7 +27,8 @@ impl SeenBackground {
         self.evidence.as_ref()
     }
 
-    /// Returns the evidence inside `bounds` (x0, y0, x1, y1, ends excluded), measured anew only where it was not measured.
+    /// Returns the evidence inside `bounds` (x0, y0, x1, y1, ends excluded): a part of what was measured, or all of it measured
+    /// anew where `bounds` exceed the gate's.
     pub(crate) fn evidence_in(&self, light: &BackgroundLight<'_>, picture: &Rgb, bounds: [usize; 4]) -> Option<Grid> {
         let ([x0, y0, x1, y1], [left, top, right, bottom]) = (bounds, self.bounds);
         if x0 < left || y0 < top || x1 > right || y1 > bottom {

@@ -19,21 +19,26 @@ pub fn resident_mib() -> Option<f64> {
     Some(kib / 1024.0)
 }
 
-/// Lets threads share the pools of glibc's allocator, one for two cores. By default each of the many threads has its own, and what
-/// they free stays spread over all of them: a rig of three cameras then needs half as much memory again. Call it at the beginning of
-/// `main`. Does nothing with other allocators.
+/// Lets threads share the pools of glibc's allocator: one for every two cores, at least two and at most eight. By default each of many
+/// threads has its own, and what they free stays spread over all of them: a rig of three cameras then needs half as much memory again.
+/// Leaves the number alone where the user has set one. Call it at the beginning of `main`. Does nothing with other allocators.
 #[allow(unsafe_code)]
 pub fn share_memory_pools() {
     #[cfg(all(target_os = "linux", target_env = "gnu"))]
     {
+        let is_set = std::env::var_os("MALLOC_ARENA_MAX").is_some()
+            || std::env::var("GLIBC_TUNABLES").is_ok_and(|all| all.contains("glibc.malloc.arena_max"));
+        if is_set {
+            return;
+        }
         let cores = std::thread::available_parallelism().map_or(2, std::num::NonZero::get);
         // SAFETY: the call takes two numbers, and may be made at any time.
         unsafe { libc::mallopt(libc::M_ARENA_MAX, (cores / 2).clamp(2, 8) as libc::c_int) };
     }
 }
 
-/// Gives memory that large and short work has left free back to the system. Takes milliseconds. Does nothing with other allocators than
-/// glibc's.
+/// Returns to the system the memory that a large, short task has left free. Takes milliseconds, in which other threads that allocate may
+/// wait. Does nothing with allocators other than glibc's.
 #[allow(unsafe_code)]
 pub(crate) fn release_free_memory() {
     #[cfg(all(target_os = "linux", target_env = "gnu"))]
