@@ -79,7 +79,7 @@ pub(crate) fn eliminate(points: &[Vec3], normals: &[Vec3], keep: usize, area: f6
     (0..points.len()).filter(|&i| alive[i]).collect()
 }
 
-/// Points whose neighbours are found by one parallel task, in one list: a list for each point would leave the memory in pieces.
+/// Points whose neighbours one parallel task finds, in one list: a list for each point would fragment the memory.
 const POINTS_A_TASK: usize = 4096;
 
 /// Neighbours of consecutive points. The weights by which they repel each other are computed again where they are needed: stored, they
@@ -100,8 +100,8 @@ impl Neighbors {
     }
 }
 
-/// Returns the entry of a point in the heap, the highest first: its weight, then the lower index. One number is compared
-/// and moved in a fraction of the time of two.
+/// Returns a point's entry in the heap, which orders by weight, then puts the lower index first. A single number is compared
+/// and moved in a fraction of the time that a pair takes.
 fn entry(weight: f32, index: usize) -> u64 {
     let bits = weight.to_bits();
     let ordered = if bits >> 31 == 0 { bits | 1 << 31 } else { !bits };

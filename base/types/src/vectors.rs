@@ -1,4 +1,4 @@
-//! The vector instructions that native kernels use.
+//! Choice of the vector instructions that native kernels use.
 
 use std::env;
 use std::sync::OnceLock;
@@ -9,14 +9,15 @@ const VARIABLE: &str = "FLYRIG_VECTORS";
 /// Runs `work` compiled for the best vector instructions that the processor has. The work must be inlined into the call to
 /// benefit from them.
 ///
-/// `FLYRIG_VECTORS=avx2` leaves AVX-512 out, `FLYRIG_VECTORS=none` all of them: for tests and benchmarks of what other
-/// processors compute. The pose network's products, which a library computes, are not limited.
+/// `FLYRIG_VECTORS=avx2` leaves AVX-512 out, `FLYRIG_VECTORS=none` leaves all of them out: for tests and benchmarks of other
+/// processors. It is read once and limits x86 processors only. The pose network's products, which a library computes, are
+/// not limited.
 #[inline]
 pub fn vectorized<W: pulp::WithSimd>(work: W) -> W::Output {
     instructions().dispatch(work)
 }
 
-/// Returns the value of `FLYRIG_VECTORS` where it is none that limits the instructions.
+/// Returns the value of `FLYRIG_VECTORS` if it is not one that limits the instructions.
 #[must_use]
 pub fn wrong_vectors_limit() -> Option<String> {
     env::var(VARIABLE).ok().filter(|value| limited(value).is_none())

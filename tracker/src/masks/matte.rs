@@ -46,8 +46,8 @@ const DEEP_PX: f32 = 24.0;
 const LOOKS_EMPTY: f32 = 0.4;
 
 /// Solves for coverage and foreground colour along the outline of a mask. Without a background, or where it has another
-/// size, the colours around the mask are used. `seen` is what the estimation of the mask has measured of the background in
-/// this image; without it, it is measured here.
+/// size, the colours around the mask are used. `seen` is the background as the mask estimation measured it in this
+/// image; without it, the background is measured here.
 ///
 /// ```
 /// use flyrig_tracker::matte;

@@ -1,4 +1,4 @@
-//! What the estimation of a mask has measured of the background, for the matte of the same image.
+//! Background as the mask estimation measured it in one image; the matte of the same image uses it again.
 
 use crate::image::grid::Grid;
 use crate::image::pixels::Rgb;

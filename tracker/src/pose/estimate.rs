@@ -76,7 +76,7 @@ pub struct PoseEstimate {
     pub pose: Pose,
     /// Person's mask in each view, at the image's size, in rig order.
     pub masks: Vec<Option<Mask>>,
-    /// Background around the person as the estimation of each mask has measured it, in rig order.
+    /// Background around the person in each view, as the mask estimation measured it, in rig order.
     pub backgrounds: Vec<Option<SeenBackground>>,
     /// Landmarks of each view in which the network ran and found the person, in rig order.
     pub keypoints: Vec<Option<ViewKeypoints>>,

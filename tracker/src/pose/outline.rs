@@ -28,7 +28,7 @@ pub(crate) struct SeenBody<'a> {
     /// World positions and normals of the template's vertices at the image's time.
     pub vertices: &'a [Vec3],
     pub normals: &'a [Vec3],
-    /// Gate in which these vertices are drawn already; `None` draws them.
+    /// Gate in which these vertices are already drawn; without one, they are drawn here.
     pub gate: Option<&'a BodyGate>,
 }
 
