@@ -49,7 +49,7 @@ impl fmt::Debug for Simulator {
 }
 
 impl Simulator {
-    /// Creates the person, the room and the cameras.
+    /// Creates the person, the room and the cameras. They are drawn on the adapter of `gpu`, which is opened if need be.
     ///
     /// # Errors
     /// [`SimError`] names the setting, the missing file or the adapter's limit.
@@ -57,7 +57,7 @@ impl Simulator {
         let rig = camera_ring(config)?;
         let cast = Cast::new(config)?;
         let people: Vec<&Person> = cast.actors().map(|actor| &actor.person).collect();
-        let drawing = Drawing::new(gpu, [config.width, config.height], Scene::new(config, &rig), &people)?;
+        let drawing = Drawing::new(&gpu.with_adapter()?, [config.width, config.height], Scene::new(config, &rig), &people)?;
         let cameras = rig.cameras.iter().map(|_| Kept::default()).collect();
         let mut new = Self { config: config.clone(), rig, cast, plates: Vec::new(), drawing, posed: None, cameras };
         for slot in 0..new.rig.cameras.len() {

@@ -135,7 +135,8 @@ struct Metrics {
 /// Runs the command.
 pub fn demo(args: &DemoArgs, gpu: &GpuContext) -> Result<()> {
     args.output.create()?;
-    eprintln!("demo: simulated rig drawn by {}, people by {}", gpu.adapter_name(), gpu.fastest().adapter_name());
+    let drawn_by = gpu.with_adapter()?.adapter_name();
+    eprintln!("demo: simulated rig drawn by {drawn_by}, people by {}", gpu.fastest().adapter_name());
     let simulator = Arc::new(Mutex::new(Simulator::new(gpu, &sim_config(args)?)?));
 
     let publisher = Publisher::open(&TransportConfig {

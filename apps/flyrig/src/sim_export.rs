@@ -75,7 +75,7 @@ pub fn sim_export(args: &SimExportArgs, config: &SimConfig, gpu: &GpuContext) ->
         names.len(),
         exported.pictures,
         started.elapsed().as_secs_f64(),
-        gpu.adapter_name()
+        gpu.with_adapter()?.adapter_name()
     );
     if exported.lost > 0 {
         println!("{} frames were lost by the fault script; truth/frames.csv says which", exported.lost);

@@ -7,16 +7,17 @@ use flyrig_gpu::{AdapterChoice, GpuContext};
 use flyrig_types::{escape_controls, shorten_values, shortened, wrong_vectors_limit};
 use tracing_subscriber::EnvFilter;
 
-/// Opens the graphics adapter with this text in its name, or the fastest one.
+/// Opens the graphics adapter with this text in its name, or the fastest one; none where the processor is faster
+/// ([`GpuContext::fastest_of`]).
 ///
 /// # Errors
-/// No adapter was found; explains what to install.
+/// No adapter has the name, or the adapter does not open.
 pub fn open_gpu(adapter: Option<&str>) -> Result<GpuContext> {
     let choice = match adapter {
         Some(name) if !name.is_empty() => AdapterChoice::Named(name.to_owned()),
         _ => AdapterChoice::Best,
     };
-    Ok(GpuContext::new(&choice)?)
+    Ok(GpuContext::fastest_of(&choice)?)
 }
 
 /// Name of the variable that keeps Mesa from asking the desktop which adapter it uses.

@@ -73,7 +73,7 @@ pub struct ReplaySettings {
 ///     true_joints: Vec::new(),
 ///     body: None,
 /// };
-/// let mut replay = Replay::open(&settings, &GpuContext::new(&AdapterChoice::Best)?)?;
+/// let mut replay = Replay::open(&settings, &GpuContext::fastest_of(&AdapterChoice::Best)?)?;
 /// while let Some(set) = replay.next_set()? {
 ///     replay.session.process(&set)?;
 ///     let view = replay.session.render(&replay.holdout[0])?;

@@ -45,8 +45,17 @@ pub(crate) struct AssetJoint {
 pub(crate) struct Target {
     pub kind: TargetKind,
     pub vertices: Vec<u32>,
-    /// Displacement of each vertex at weight 1, metres.
-    pub displacement: Vec<[f32; 3]>,
+    /// Displacement of each vertex at weight 1, in steps of `step_m` as in the file: metres would take twice the memory.
+    steps: Vec<[i16; 3]>,
+    step_m: f32,
+}
+
+impl Target {
+    /// Iterates over the moved vertices with their displacements at weight 1, metres.
+    pub fn moves(&self) -> impl Iterator<Item = (usize, [f32; 3])> {
+        let metres = |steps: &[i16; 3]| steps.map(|step| f32::from(step) * self.step_m);
+        self.vertices.iter().zip(&self.steps).map(move |(vertex, steps)| (*vertex as usize, metres(steps)))
+    }
 }
 
 #[derive(Debug)]
@@ -117,10 +126,8 @@ fn unpack(file: &[u8]) -> Result<BodyAsset, String> {
         });
         let moved: Vec<u32> = moved.collect();
         let [x, y, z] = [(); 3].map(|()| rest.array::<2, 1, _>(target.count, i16s));
-        let (x, y, z) = (x?, y?, z?);
-        let metres = |steps: [i16; 1]| f32::from(steps[0]) * target.step_m;
-        let displacement = (0..target.count).map(|i| [metres(x[i]), metres(y[i]), metres(z[i])]).collect();
-        targets.push(Target { kind, vertices: moved, displacement });
+        let steps = x?.into_iter().zip(y?).zip(z?).map(|(([x], [y]), [z])| [x, y, z]).collect();
+        targets.push(Target { kind, vertices: moved, steps, step_m: target.step_m });
     }
     let asset = BodyAsset {
         vertices,

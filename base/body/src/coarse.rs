@@ -41,7 +41,7 @@ pub fn coarsen(
         return Err(BodyError::Mesh { name: template.name.clone(), message });
     }
     let area = template.area_m2();
-    let kept = eliminate(&surface.positions, &surface.normals, count.clamp(1, all), area);
+    let kept = eliminate(surface.positions.clone(), surface.normals.clone(), count.clamp(1, all), area);
     let positions: Vec<Vec3> = kept.iter().map(|&i| surface.positions[i]).collect();
     let normals: Vec<Vec3> = kept.iter().map(|&i| surface.normals[i]).collect();
     let spacing_m = (area / kept.len() as f64).sqrt();

@@ -112,8 +112,8 @@ fn shaped_vertices(asset: &BodyAsset, shape: &ShapeParams) -> Vec<Vec3> {
             TargetKind::Macro(tags) => tags.iter().map(|tag| tag_weight(asset, tag, &given)).product(),
         };
         if weight > 0.0 {
-            for (&vertex, &moved) in target.vertices.iter().zip(&target.displacement) {
-                vertices[vertex as usize] += weight * Vec3::from(moved);
+            for (vertex, moved) in target.moves() {
+                vertices[vertex] += weight * Vec3::from(moved);
             }
         }
     }

@@ -17,19 +17,22 @@ const GAMMA: f32 = 1.5;
 
 /// Selects `keep` of the points that lie evenly on a surface of `area` square metres; returns their indices, ascending. Points
 /// whose normals oppose each other lie on different sheets and do not repel each other.
-pub(crate) fn eliminate(points: &[Vec3], normals: &[Vec3], keep: usize, area: f64) -> Vec<usize> {
-    if keep >= points.len() {
-        return (0..points.len()).collect();
+///
+/// Takes the points for good: with the lists of neighbours this is where a session needs the most memory.
+pub(crate) fn eliminate(points: Vec<Vec3>, normals: Vec<Vec3>, keep: usize, area: f64) -> Vec<usize> {
+    let count = points.len();
+    if keep >= count {
+        return (0..count).collect();
     }
     // Radius of the densest packing of `keep` discs.
     let r_max = (area / (2.0 * 3.0f64.sqrt() * keep as f64)).sqrt() as f32;
-    let r_min = r_max * (1.0 - (keep as f32 / points.len() as f32).powf(GAMMA)) * BETA;
+    let r_min = r_max * (1.0 - (keep as f32 / count as f32).powf(GAMMA)) * BETA;
     let weight = |distance: f32| (1.0 - distance.max(2.0 * r_min) / (2.0 * r_max)).max(0.0).powi(ALPHA);
 
     // By place in the grid, so that neighbours lie beside each other in memory.
-    let order = PointGrid::new(points, 2.0 * r_max).order();
-    let placed: Vec<Vec3> = order.iter().map(|&index| points[index as usize]).collect();
-    let normals: Vec<Vec3> = order.iter().map(|&index| normals[index as usize]).collect();
+    let order = PointGrid::new(&points, 2.0 * r_max).order();
+    let in_order = |given: Vec<Vec3>| -> Vec<Vec3> { order.iter().map(|&index| given[index as usize]).collect() };
+    let (placed, normals) = (in_order(points), in_order(normals));
     let grid = PointGrid::new(&placed, 2.0 * r_max);
     let starts: Vec<usize> = (0..placed.len()).step_by(POINTS_A_TASK).collect();
     let neighbors: Vec<Neighbors> = starts
@@ -47,17 +50,19 @@ pub(crate) fn eliminate(points: &[Vec3], normals: &[Vec3], keep: usize, area: f6
                 found.ends.push(found.list.len());
                 found.weights.push(sum);
             }
+            found.list.shrink_to_fit();
             found
         })
         .collect();
+    drop((grid, normals));
     let of_point = |place: usize| neighbors[place / POINTS_A_TASK].of(place % POINTS_A_TASK);
     let mut weights: Vec<f32> = neighbors.iter().flat_map(|found| &found.weights).copied().collect();
-    let mut places = vec![0u32; points.len()];
+    let mut places = vec![0u32; count];
     order.iter().enumerate().for_each(|(place, &index)| places[index as usize] = place as u32);
     let mut heap: BinaryHeap<u64> =
         places.iter().enumerate().map(|(index, &place)| entry(weights[place as usize], index)).collect();
-    let mut alive = vec![true; points.len()];
-    let mut left = points.len();
+    let mut alive = vec![true; count];
+    let mut left = count;
     while left > keep {
         let Some(mut highest) = heap.peek_mut() else { break };
         let index = (u32::MAX - *highest as u32) as usize;
@@ -76,7 +81,7 @@ pub(crate) fn eliminate(points: &[Vec3], normals: &[Vec3], keep: usize, area: f6
             weights[neighbor] -= weight(placed[place].distance_squared(placed[neighbor]).sqrt());
         }
     }
-    (0..points.len()).filter(|&i| alive[i]).collect()
+    (0..count).filter(|&i| alive[i]).collect()
 }
 
 /// Points whose neighbours one parallel task finds, in one list: a list for each point would fragment the memory.
@@ -128,16 +133,16 @@ mod tests {
         let mut rng = rand::rngs::StdRng::seed_from_u64(5);
         let (count, keep) = (POINTS_A_TASK + 1904, 600);
         let points: Vec<Vec3> = (0..count).map(|_| Vec3::new(rng.random(), rng.random(), 0.0)).collect();
-        let kept = eliminate(&points, &vec![Vec3::Z; count], keep, 1.0);
+        let kept = eliminate(points.clone(), vec![Vec3::Z; count], keep, 1.0);
         assert!(kept.len() == keep && kept.is_sorted_by(|a, b| a < b));
         let packed = 2.0 * (1.0 / (2.0 * 3.0f32.sqrt() * keep as f32)).sqrt();
         let pairs = kept.iter().flat_map(|a| kept.iter().filter(move |b| *b > a).map(move |b| (a, b)));
         let least = pairs.map(|(a, b)| points[*a].distance(points[*b])).fold(f32::INFINITY, f32::min);
         assert!(least > 0.6 * packed, "{least} of {packed}");
         // The same place on two sheets: neither point repels the other.
-        let normals = [Vec3::Z, -Vec3::Z, Vec3::Z];
-        let twice = [Vec3::ZERO, Vec3::ZERO, Vec3::X * 1e-3];
-        assert!(eliminate(&twice, &normals, 2, 1.0).contains(&1));
-        assert!(eliminate(&[], &[], 0, 1.0).is_empty());
+        let normals = vec![Vec3::Z, -Vec3::Z, Vec3::Z];
+        let twice = vec![Vec3::ZERO, Vec3::ZERO, Vec3::X * 1e-3];
+        assert!(eliminate(twice, normals, 2, 1.0).contains(&1));
+        assert!(eliminate(Vec::new(), Vec::new(), 0, 1.0).is_empty());
     }
 }

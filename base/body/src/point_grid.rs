@@ -123,4 +123,21 @@ mod tests {
         }
         PointGrid::new(&[], 1.0).within(Vec3::ZERO, 1.0, |_, _| panic!("no points"));
     }
+
+    #[test]
+    fn the_order_holds_every_point_once_and_mostly_beside_its_neighbours() {
+        let mut rng = rand::rngs::StdRng::seed_from_u64(6);
+        let points: Vec<Vec3> = (0..2000).map(|_| Vec3::from_array(rng.random::<[f32; 3]>())).collect();
+        let order = PointGrid::new(&points, 0.1).order();
+        let mut sorted = order.clone();
+        sorted.sort_unstable();
+        assert!(sorted.into_iter().eq(0..2000));
+        let length = |order: &mut dyn Iterator<Item = u32>| {
+            let places: Vec<Vec3> = order.map(|index| points[index as usize]).collect();
+            places.windows(2).map(|pair| pair[0].distance(pair[1])).sum::<f32>()
+        };
+        let (in_order, as_given) = (length(&mut order.into_iter()), length(&mut (0..2000)));
+        assert!(in_order < 0.3 * as_given, "{in_order} of {as_given}");
+        assert!(PointGrid::new(&[], 1.0).order().is_empty());
+    }
 }

@@ -107,20 +107,25 @@ pub fn sample_surface(template: &Template, count: usize, seed: u64) -> Result<Su
         let [a, b, c] = corners(template, &template.triangles[candidate.0 as usize]);
         blend(&template.normals, candidate).try_normalize().unwrap_or((b - a).cross(c - a).normalize_or(Vec3::Y))
     };
-    let thrown_positions: Vec<Vec3> = candidates.iter().map(|&c| blend(&template.positions, c)).collect();
-    let thrown_normals: Vec<Vec3> = candidates.iter().map(|&c| normal(c)).collect();
-    let kept = eliminate(&thrown_positions, &thrown_normals, count, area);
+    let position = |candidate: (u32, [f32; 3])| blend(&template.positions, candidate);
+    let kept = eliminate(
+        candidates.iter().map(|&c| position(c)).collect(),
+        candidates.iter().map(|&c| normal(c)).collect(),
+        count,
+        area,
+    );
+    let candidates: Vec<(u32, [f32; 3])> = kept.iter().map(|&i| candidates[i]).collect();
+    drop(kept);
 
-    let positions: Vec<Vec3> = kept.iter().map(|&i| thrown_positions[i]).collect();
-    let normals: Vec<Vec3> = kept.iter().map(|&i| thrown_normals[i]).collect();
+    let positions: Vec<Vec3> = candidates.iter().map(|&c| position(c)).collect();
+    let normals: Vec<Vec3> = candidates.iter().map(|&c| normal(c)).collect();
     let scale_m = scales(&positions, &normals, (area / count as f64).sqrt() as f32);
     let part_of_joint = part_of_joints(&template.skeleton);
-    let skin: Vec<SkinWeights> = kept.iter().map(|&i| blend_skin(template, candidates[i])).collect();
+    let skin: Vec<SkinWeights> = candidates.iter().map(|&c| blend_skin(template, c)).collect();
     Ok(SurfaceGaussians {
-        uvs: kept
+        uvs: candidates
             .iter()
-            .map(|&i| {
-                let (triangle, weights) = candidates[i];
+            .map(|&(triangle, weights)| {
                 let corners = template.triangles[triangle as usize];
                 corners.iter().zip(weights).map(|(&corner, w)| template.uvs[corner as usize] * w).sum()
             })
@@ -128,9 +133,9 @@ pub fn sample_surface(template: &Template, count: usize, seed: u64) -> Result<Su
         parts: skin.iter().map(|s| part_of_joint[usize::from(s.joints[0])]).collect(),
         skin,
         scale_m,
-        depth_m: vec![0.0; kept.len()],
-        triangle: kept.iter().map(|&i| candidates[i].0).collect(),
-        barycentric: kept.iter().map(|&i| candidates[i].1).collect(),
+        depth_m: vec![0.0; candidates.len()],
+        triangle: candidates.iter().map(|c| c.0).collect(),
+        barycentric: candidates.iter().map(|c| c.1).collect(),
         positions,
         normals,
     })

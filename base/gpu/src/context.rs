@@ -1,8 +1,12 @@
 //! Choice of an adapter and opening of a device.
 
-use std::sync::Arc;
+use std::sync::{Arc, Mutex};
 
-use wgpu::{Adapter, AdapterInfo, Backends, Device, DeviceType, Features, Instance, InstanceDescriptor, Queue};
+use flyrig_types::lock;
+use wgpu::{
+    Adapter, AdapterInfo, BackendOptions, Backends, Device, DeviceType, Features, Instance, InstanceDescriptor,
+    Limits, NoopBackendOptions, Queue,
+};
 
 use crate::{GpuError, GpuObjects, shared::Shared};
 
@@ -16,6 +20,9 @@ pub enum AdapterChoice {
     Named(String),
 }
 
+/// Largest array of a context without an adapter, bytes; a software adapter binds no larger ones either.
+const MOST_BYTES: u64 = 1 << 27;
+
 /// Open device with its queue. Clones share both.
 #[derive(Debug, Clone)]
 pub struct GpuContext {
@@ -28,6 +35,8 @@ pub struct GpuContext {
     info: AdapterInfo,
     choice: AdapterChoice,
     on_processor: bool,
+    /// Context of the chosen adapter, for one that was created without; opened when it is first needed.
+    on_adapter: Arc<Mutex<Option<Box<GpuContext>>>>,
     pub(crate) shared: Arc<Shared>,
 }
 
@@ -37,11 +46,51 @@ impl GpuContext {
     /// # Errors
     /// [`GpuError`] names what is missing and what to install.
     pub fn new(choice: &AdapterChoice) -> Result<Self, GpuError> {
-        pollster::block_on(Self::open(choice))
+        pollster::block_on(async { Self::open(adapters().await, choice).await })
     }
 
-    async fn open(choice: &AdapterChoice) -> Result<Self, GpuError> {
-        let (instance, mut adapters) = adapters().await;
+    /// Opens the chosen adapter, unless kernels run faster on the processor: without an adapter, or with a software one that was not
+    /// chosen by name. Then no driver takes memory; [`Self::with_adapter`] opens the adapter where something must be drawn on it.
+    ///
+    /// # Errors
+    /// As [`Self::new`].
+    pub fn fastest_of(choice: &AdapterChoice) -> Result<Self, GpuError> {
+        pollster::block_on(async {
+            if *choice != AdapterChoice::Best {
+                return Self::open(adapters().await, choice).await;
+            }
+            if may_have_hardware() {
+                let found = adapters().await;
+                if found.1.iter().any(|adapter| adapter.get_info().device_type != DeviceType::Cpu) {
+                    return Self::open(found, choice).await;
+                }
+            }
+            Self::without_adapter().await
+        })
+    }
+
+    /// Creates a context without an adapter: wgpu's backend that does nothing stands in, and kernels run on the processor.
+    async fn without_adapter() -> Result<Self, GpuError> {
+        let limits = Limits {
+            max_buffer_size: MOST_BYTES,
+            max_storage_buffer_binding_size: MOST_BYTES,
+            ..Limits::unlimited()
+        };
+        let noop = NoopBackendOptions { enable: true, limits: Some(limits), ..NoopBackendOptions::default() };
+        let instance = Instance::new(InstanceDescriptor {
+            backends: Backends::NOOP,
+            backend_options: BackendOptions { noop, ..BackendOptions::default() },
+            ..InstanceDescriptor::new_without_display_handle()
+        });
+        let adapters = instance.enumerate_adapters(Backends::NOOP).await;
+        let context = Self::open((instance, adapters), &AdapterChoice::Best).await?;
+        Ok(Self { on_processor: true, ..context })
+    }
+
+    async fn open(
+        (instance, mut adapters): (Instance, Vec<Adapter>),
+        choice: &AdapterChoice,
+    ) -> Result<Self, GpuError> {
         if adapters.is_empty() {
             return Err(GpuError::NoAdapter);
         }
@@ -90,7 +139,8 @@ impl GpuContext {
         let shared = Arc::new(Shared::default());
         shared.fault.watch(&device);
         let choice = choice.clone();
-        Ok(Self { device, queue, instance, adapter, info, choice, on_processor: false, shared })
+        let on_adapter = Arc::default();
+        Ok(Self { device, queue, instance, adapter, info, choice, on_processor: false, on_adapter, shared })
     }
 
     /// Opens the chosen adapter again, after the loss of a device. The new context shares nothing with this one.
@@ -98,6 +148,9 @@ impl GpuContext {
     /// # Errors
     /// As [`Self::new`].
     pub fn reopen(&self) -> Result<Self, GpuError> {
+        if !self.has_adapter() {
+            return pollster::block_on(Self::without_adapter());
+        }
         Ok(Self { on_processor: self.on_processor, ..Self::new(&self.choice)? })
     }
 
@@ -107,6 +160,29 @@ impl GpuContext {
     #[must_use]
     pub fn on_processor(&self) -> Self {
         Self { on_processor: true, ..self.clone() }
+    }
+
+    /// Returns this context with kernels on the adapter, which is opened where it was not yet: for what has no native form, such as the
+    /// pictures of the simulator. All clones share one such context.
+    ///
+    /// # Errors
+    /// As [`Self::new`].
+    pub fn with_adapter(&self) -> Result<Self, GpuError> {
+        if self.has_adapter() {
+            return Ok(Self { on_processor: false, ..self.clone() });
+        }
+        let mut opened = lock(&self.on_adapter);
+        if let Some(context) = &*opened {
+            return Ok((**context).clone());
+        }
+        let context = Self::new(&self.choice)?;
+        *opened = Some(Box::new(context.clone()));
+        Ok(context)
+    }
+
+    /// Returns whether an adapter is open, and not only its stand-in.
+    fn has_adapter(&self) -> bool {
+        self.info.backend != wgpu::Backend::Noop
     }
 
     /// Returns whether kernels run natively on the processor.
@@ -179,6 +255,24 @@ impl GpuContext {
     }
 }
 
+/// Returns false where no driver of a graphics processor has a device file. Then the adapters need not be listed: Mesa's software
+/// driver stays in memory once it was loaded, with 60 MB.
+#[cfg(target_os = "linux")]
+fn may_have_hardware() -> bool {
+    /// Beginnings of the names: desktop and server drivers, Tegra, Windows' own below Linux, Adreno, Mali, PowerVR.
+    const NAMES: [&str; 8] = ["dri", "nvidia", "nvhost", "nvmap", "dxg", "kgsl", "mali", "pvr"];
+    let Ok(devices) = std::fs::read_dir("/dev") else { return true };
+    devices.filter_map(Result::ok).any(|entry| {
+        let name = entry.file_name();
+        NAMES.iter().any(|start| name.as_encoded_bytes().starts_with(start.as_bytes()))
+    })
+}
+
+#[cfg(not(target_os = "linux"))]
+fn may_have_hardware() -> bool {
+    true
+}
+
 /// Lists all adapters, the fastest kind first.
 async fn adapters() -> (Instance, Vec<Adapter>) {
     let instance = Instance::new(InstanceDescriptor {
@@ -208,5 +302,52 @@ fn rank(kind: DeviceType) -> u8 {
         DeviceType::VirtualGpu => 2,
         DeviceType::Other => 3,
         DeviceType::Cpu => 4,
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::StorageBuffer;
+
+    fn without_adapter() -> GpuContext {
+        pollster::block_on(GpuContext::without_adapter()).unwrap()
+    }
+
+    #[test]
+    fn arrays_need_no_adapter() {
+        let gpu = without_adapter();
+        assert!(gpu.is_on_processor() && gpu.fastest().is_on_processor() && gpu.adapter_name().starts_with("processor"));
+        let values = StorageBuffer::from_slice(&gpu, "values", &[1.0f32, 2.0, 3.0]).unwrap();
+        let mut encoder = gpu.device.create_command_encoder(&Default::default());
+        values.encode_write(&gpu, &mut encoder, &[4.0, 5.0]);
+        gpu.queue.submit([encoder.finish()]);
+        gpu.wait().unwrap();
+        assert_eq!(values.read(&gpu).unwrap(), [4.0, 5.0, 3.0]);
+        let again = gpu.reopen().unwrap();
+        assert!(again.is_on_processor() && !again.has_adapter());
+        let error = StorageBuffer::<[f32; 4]>::zeroed(&gpu, "too many", 1 << 24).unwrap_err();
+        assert!(matches!(error, GpuError::TooLarge { .. }), "{error}");
+    }
+
+    #[test]
+    fn the_adapter_is_opened_once_for_all_clones() {
+        let gpu = without_adapter();
+        let (first, second) = (gpu.with_adapter().unwrap(), gpu.clone().with_adapter().unwrap());
+        assert!(first.has_adapter() && !first.is_on_processor());
+        assert_eq!(first.device, second.device);
+        let back = first.on_processor().with_adapter().unwrap();
+        assert!(back.device == first.device && !back.is_on_processor());
+    }
+
+    #[test]
+    fn an_adapter_chosen_by_name_is_opened() {
+        let name = crate::testing::device().info.name;
+        let named = GpuContext::fastest_of(&AdapterChoice::Named(name)).unwrap();
+        assert!(named.has_adapter() && !named.is_on_processor());
+        let best = GpuContext::fastest_of(&AdapterChoice::Best).unwrap();
+        assert_eq!(best.has_adapter(), !best.is_software());
+        let error = GpuContext::fastest_of(&AdapterChoice::Named("no such card".to_owned())).unwrap_err();
+        assert!(matches!(error, GpuError::NoSuchAdapter { .. }), "{error}");
     }
 }

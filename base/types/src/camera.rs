@@ -78,7 +78,7 @@ impl Lens {
         let (k, [p1, p2]) = self.rational().unwrap_or_default();
         let radial = match self {
             Self::Rational { .. } => polynomial(&series(&k[..3]), r2) / polynomial(&series(&k[3..]), r2),
-            _ => 1.0 + r2 * (k[0] + r2 * (k[1] + r2 * k[2])),
+            Self::RadialTangential { .. } | Self::Fisheye { .. } => 1.0 + r2 * (k[0] + r2 * (k[1] + r2 * k[2])),
         };
         DVec2::new(
             x * radial + 2.0 * p1 * x * y + p2 * (r2 + 2.0 * x * x),
@@ -490,6 +490,22 @@ mod tests {
         assert!((pixel - DVec2::new(370.0, 138.0)).length() < 1e-9);
         assert_eq!(camera(Lens::PINHOLE).project(DVec3::new(0.0, -4.0, 1.0)), None, "behind");
         assert_eq!(camera(Lens::PINHOLE).project(DVec3::new(f64::NAN, 0.0, 0.0)), None);
+    }
+
+    /// The quick test of a radial lens is a closed form of the one for rational lenses.
+    #[test]
+    fn a_radial_lens_is_valid_where_the_same_rational_one_is() {
+        for k1 in [-0.6, -0.25, 0.0, 0.3] {
+            for (k2, k3) in [(0.0, 0.0), (0.08, -0.02), (-0.1, 0.03), (0.4, 0.1)] {
+                let radial = Lens::RadialTangential { radial: [k1, k2, k3], tangential: [0.0; 2] };
+                let rational = Lens::Rational { radial: [k1, k2, k3, 0.0, 0.0, 0.0], tangential: [0.0; 2] };
+                for step in 0..60 {
+                    let radius = 0.05 * f64::from(step);
+                    assert_eq!(radial.surely_grows(radius), rational.surely_grows(radius), "{k1} {k2} {k3} {radius}");
+                }
+                assert!((radial.valid_radius() - rational.valid_radius()).abs() < 1e-9, "{k1} {k2} {k3}");
+            }
+        }
     }
 
     #[test]

@@ -20,7 +20,8 @@ pub fn vectorized<W: pulp::WithSimd>(work: W) -> W::Output {
 /// Returns the value of `FLYRIG_VECTORS` if it is not one that limits the instructions.
 #[must_use]
 pub fn wrong_vectors_limit() -> Option<String> {
-    env::var(VARIABLE).ok().filter(|value| limited(value).is_none())
+    let value = env::var_os(VARIABLE)?.to_string_lossy().into_owned();
+    limited(&value).is_none().then_some(value)
 }
 
 fn instructions() -> pulp::Arch {

@@ -44,7 +44,7 @@ pub fn run() -> Result<(Vec<Splat>, RenderedView), Box<dyn Error>> {
     let track =
         PoseTrack::new(vec![(0, template.skeleton.rest_pose()), (1_000_000_000, template.skeleton.rest_pose())])?;
     let settings = SessionSettings { body: BodySettings::with_gaussians(12_000), ..SessionSettings::default() };
-    let mut session = SessionBuilder::new(GpuContext::new(&AdapterChoice::Best)?, rig.clone())
+    let mut session = SessionBuilder::new(GpuContext::fastest_of(&AdapterChoice::Best)?, rig.clone())
         .settings(settings)
         .perception(GivenPerception::repeating(&rig, template, track))
         .build()?;

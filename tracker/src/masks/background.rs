@@ -186,17 +186,15 @@ impl Background {
     }
 
     /// Returns the background in an exposure that was measured before; `None` for an image of another size, or an exposure of
-    /// another kind of background.
+    /// another kind of background or size of image.
     pub(crate) fn light_again(&self, picture: &Rgb, seen: &SeenBackground) -> Option<BackgroundLight<'_>> {
         if (picture.width, picture.height) != (self.width, self.height) {
             return None;
         }
-        match (&self.kind, &seen.exposure) {
+        match (&self.kind, seen.exposure_for(picture)?) {
             (Kind::Plate(plate), Exposure::Plate(drift)) => Some(BackgroundLight::Plate(plate, *drift)),
-            (Kind::Key(key), Exposure::Screen(screen)) if screen.fits(picture) => {
-                Some(BackgroundLight::Screen(key, Arc::clone(screen)))
-            }
-            _ => None,
+            (Kind::Key(key), Exposure::Screen(screen)) => Some(BackgroundLight::Screen(key, Arc::clone(screen))),
+            (Kind::Plate(_), Exposure::Screen(_)) | (Kind::Key(_), Exposure::Plate(_)) => None,
         }
     }
 }

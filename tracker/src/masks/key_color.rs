@@ -89,11 +89,6 @@ pub(crate) struct Screen {
 }
 
 impl Screen {
-    /// Whether this was measured in an image of the same size.
-    pub fn fits(&self, picture: &Rgb) -> bool {
-        (self.share.width, self.share.height) == (picture.width, picture.height)
-    }
-
     /// Returns the screen's linear light at a pixel.
     pub fn at(&self, pixel: usize) -> [f32; 3] {
         self.light.map(|light| light * self.strength.values[pixel])

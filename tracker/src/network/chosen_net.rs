@@ -86,6 +86,11 @@ impl ChosenNet {
         Ok(NetOutput { landmarks, presence, mask: None })
     }
 
+    /// Creates the error of a caller that offers a crop in BlazePose's format.
+    pub fn takes_no_crop(&self) -> TrackError {
+        self.net.failed("has an input format of its own and takes no crop of the built-in network")
+    }
+
     /// Returns the network's input from a square of RGB in 0..=1, cut by a margin left and right, or above and below.
     fn input(&self, rgb: &[f32], side: usize, margin: [usize; 2]) -> Vec<f32> {
         let [width, height] = self.size;

@@ -85,6 +85,21 @@ impl PoseNet {
         matches!(self.kind, Kind::BlazePose { .. })
     }
 
+    /// Returns the body landmarks of a crop of 256 x 256 x 3 values (RGB in 0..=1, row by row), metres from the middle of the
+    /// hips in the axes of the crop. For comparisons with other runtimes; the tracker itself crops images.
+    ///
+    /// # Errors
+    /// Kind [`crate::TrackErrorKind::Net`] when the crop has another size, the network fails or is one of the user's choice.
+    pub fn crop_world_landmarks(&self, rgb: &[f32]) -> Result<Vec<[f64; 3]>, TrackError> {
+        match &self.kind {
+            Kind::BlazePose { net, has_mask } => {
+                let output = run_blazepose(net, rgb, *has_mask)?;
+                Ok(output.landmarks.iter().filter_map(|landmark| landmark.world).collect())
+            }
+            Kind::Chosen(net) => Err(net.takes_no_crop()),
+        }
+    }
+
     /// Runs the network on a square of an image.
     ///
     /// # Errors

@@ -408,6 +408,10 @@ impl PoseEstimator {
         texture: &mut Texture,
         seconds: &mut StageSeconds,
     ) -> (Fitted, Vec<Option<Mask>>, Vec<Option<SeenBackground>>) {
+        if !self.config.masks && self.config.outline_rounds == 0 {
+            let views = pictures.len();
+            return (fitted, vec![None; views], vec![None; views]);
+        }
         let start = Instant::now();
         let body = self.posed(set, &fitted, &fitted.turns);
         let Masks { mut masks, gates, backgrounds } = self.masks(set, pictures, &mut fitted, &body);

@@ -1,6 +1,10 @@
 //! `flyrig-bench budget`: error in views and saved run time of each kind of work that a budget may skip.
 
-use std::{fmt::Write as _, path::PathBuf, time::Instant};
+use std::{
+    fmt::Write as _,
+    path::{Path, PathBuf},
+    time::Instant,
+};
 
 use anyhow::{Context, Result};
 use clap::Args;
@@ -13,7 +17,7 @@ use flyrig_report::{
     progress_bar, stop, write_whole,
 };
 use flyrig_takes::{Replay, frame_number};
-use serde::Serialize;
+use serde::{Deserialize, Serialize};
 
 use crate::harness::arguments::RecordedArgs;
 
@@ -31,6 +35,9 @@ pub struct BenchBudgetArgs {
     /// Budgets, frame sets per second, comma separated.
     #[arg(long, value_delimiter = ',', default_value = "1,2,3,4,5,6,8,10,15,30")]
     pub budgets: Vec<f64>,
+    /// File budget.json of another program on the same data set, whose results are plotted beside.
+    #[arg(long, value_name = "FILE")]
+    pub beside: Option<PathBuf>,
     #[command(flatten)]
     pub output: OutputArgs,
     #[command(flatten)]
@@ -93,6 +100,7 @@ fn ways(pose: Origin, budgets: &[f64]) -> Vec<Way> {
 
 /// Runs the command.
 pub fn budget(args: &BenchBudgetArgs, gpu: &GpuContext) -> Result<()> {
+    let beside = args.beside.as_deref().map(read_points).transpose()?.unwrap_or_default();
     args.output.create()?;
     let ways = ways(args.pose, &args.budgets);
     let bar = progress_bar(ways.len() as u64, "bench budget");
@@ -109,7 +117,7 @@ pub fn budget(args: &BenchBudgetArgs, gpu: &GpuContext) -> Result<()> {
     let table = table(&rows);
     write_whole(&args.output.out.join("budget.md"), table.as_bytes())?;
     write_whole(&args.output.out.join("budget.json"), &serde_json::to_vec_pretty(&rows)?)?;
-    write_whole(&args.output.out.join("budget.svg"), plot(&rows).svg().as_bytes())?;
+    write_whole(&args.output.out.join("budget.svg"), plot(&rows, &beside).svg().as_bytes())?;
     write_whole(&args.output.out.join("levels.svg"), plot_levels(&rows).svg().as_bytes())?;
     print!("{table}");
     println!(
@@ -195,9 +203,35 @@ fn table(rows: &[Row]) -> String {
     text
 }
 
-/// Plots run time against error: fixed configurations, levels, budgets.
-fn plot(rows: &[Row]) -> Plot {
+/// Point of a plot: milliseconds per frame set, PSNR in dB, and name.
+type Point = (f64, f64, String);
+
+/// Reads the points of a file that this command wrote.
+fn read_points(path: &Path) -> Result<Vec<Point>> {
+    #[derive(Deserialize)]
+    struct Score {
+        psnr_db: f64,
+    }
+    #[derive(Deserialize)]
+    struct Row {
+        name: String,
+        set_ms: f64,
+        score: Score,
+    }
+    let text = std::fs::read(path).with_context(|| format!("cannot read {}", path.display()))?;
+    let rows: Vec<Row> = serde_json::from_slice(&text)
+        .with_context(|| format!("{} is not a budget.json of flyrig-bench budget", path.display()))?;
+    Ok(rows.into_iter().map(|row| (row.set_ms, row.score.psnr_db, row.name)).collect())
+}
+
+/// Plots run time against error: fixed configurations, levels, budgets, and the points of another program.
+fn plot(rows: &[Row], beside: &[Point]) -> Plot {
     let full = rows.first().map_or(0.0, |row| row.score.psnr_db);
+    let beside = Series {
+        name: "other program".to_owned(),
+        points: beside.iter().map(|(ms, psnr_db, name)| (*ms, full - psnr_db, name.clone())).collect(),
+        line: Line::Front,
+    };
     let of = |name: &str, line, belongs: &dyn Fn(&str) -> bool| Series {
         name: name.to_owned(),
         points: rows
@@ -218,7 +252,10 @@ fn plot(rows: &[Row]) -> Plot {
             of("fixed configurations", Line::Front, &|name| !level(name) && !budget(name)),
             of("levels", Line::Through, &level),
             of("budgets", Line::Front, &budget),
-        ],
+        ]
+        .into_iter()
+        .chain((!beside.points.is_empty()).then_some(beside))
+        .collect(),
     }
 }
 

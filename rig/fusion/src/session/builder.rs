@@ -29,7 +29,7 @@ use crate::{
 /// let plates: Vec<_> = rig.cameras.iter().map(|_| None).collect();
 /// let body = default_template(&ShapeParams::default())?;
 /// let perception = EstimatedPerception::new(&rig, &body, &settings.perception, &plates)?;
-/// let gpu = GpuContext::new(&AdapterChoice::Best)?;
+/// let gpu = GpuContext::fastest_of(&AdapterChoice::Best)?;
 /// let session = SessionBuilder::new(gpu, rig).settings(settings).perception(perception).build()?;
 /// assert!(!session.has_people(), "no person was seen yet");
 /// # Ok(())
