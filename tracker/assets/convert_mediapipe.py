@@ -12,7 +12,7 @@
 
 The TFLite files store their weights as 16-bit floats. The converter widens them; this script narrows
 them back (exactly, checked) behind a Cast, which halves the file. Only the outputs the tracker reads
-are kept (OUTPUTS): the heatmaps of the pose network go, and handedness and world landmarks of the hand's.
+are kept (OUTPUTS): handedness and world landmarks of the hand go.
 The result is compared with the TFLite interpreter on random pictures.
 """
 
@@ -27,8 +27,8 @@ from onnx import TensorProto, helper, numpy_helper
 
 # Outputs of each network in the TFLite file and their names here.
 OUTPUTS = {
-    # 39 landmarks x 5, one presence, 256x256 mask, 39 world landmarks x 3.
-    "pose": {"Identity": "landmarks", "Identity_1": "presence", "Identity_2": "mask", "Identity_4": "world_landmarks"},
+    # 39 landmarks x 5, one presence, 256x256 mask, 64x64 cells x 39 heatmaps (logits), 39 world landmarks x 3.
+    "pose": {"Identity": "landmarks", "Identity_1": "presence", "Identity_2": "mask", "Identity_3": "heatmap", "Identity_4": "world_landmarks"},
     # 21 landmarks x 3, one presence. Left out: handedness, 21 world landmarks x 3.
     "hand": {"Identity": "landmarks", "Identity_1": "presence"},
     # 468 landmarks x 3, one presence logit.

@@ -37,7 +37,7 @@ pub use hands::hand_net::{HAND_LANDMARKS, HAND_SIDE, HandNet, HandOutput};
 pub use hands::quality::{HandQuality, HandState, HandsQuality, HeadQuality};
 pub use hands::tracker::{HandConfig, HandTracker};
 pub use image::pixels::is_blank;
-pub use landmarks::keypoints::{Keypoint, LANDMARK_COUNT, LANDMARK_NAMES, ViewKeypoints};
+pub use landmarks::keypoints::{Keypoint, LANDMARK_COUNT, LANDMARK_NAMES, Sharpness, ViewKeypoints};
 pub use landmarks::presence::shows_person;
 pub use landmarks::study::{ConfidenceSpread, LandmarkBias, LandmarkStudy};
 pub use landmarks::triangulate::{WorldPoint, triangulate};

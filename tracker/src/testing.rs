@@ -58,7 +58,7 @@ pub(crate) fn ring(count: usize) -> Rig {
 
 pub(crate) fn keypoints_of(camera: &Camera, points: &[DVec3; LANDMARK_COUNT]) -> ViewKeypoints {
     points.map(|point| match camera.project(point) {
-        Some(pixel) => Keypoint { pixel, confidence: 0.9 },
+        Some(pixel) => Keypoint { pixel, confidence: 0.9, ..Default::default() },
         None => Keypoint::default(),
     })
 }

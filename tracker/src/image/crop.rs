@@ -5,7 +5,7 @@ use glam::{DVec2, DVec3};
 
 use crate::image::pixels::Rgb;
 use crate::landmarks::keypoints::{
-    Keypoint, LANDMARK_COUNT, LEFT_HIP, LEFT_SHOULDER, RIGHT_HIP, RIGHT_SHOULDER, ViewKeypoints,
+    Keypoint, LANDMARK_COUNT, LEFT_HIP, LEFT_SHOULDER, RIGHT_HIP, RIGHT_SHOULDER, Sharpness, ViewKeypoints,
 };
 use crate::network::output::{NET_SIDE, NetOutput};
 
@@ -86,7 +86,14 @@ impl Crop {
     pub fn keypoints(&self, output: &NetOutput) -> ViewKeypoints {
         std::array::from_fn(|i| {
             let landmark = output.landmarks[i];
-            Keypoint { pixel: self.to_image(DVec2::new(landmark.x, landmark.y)), confidence: landmark.confidence }
+            let sharpness = match landmark.sharpness {
+                Sharpness::Peak { spread_cells, along, aspect } => {
+                    Sharpness::Peak { spread_cells, along: self.turn.rotate(along), aspect }
+                }
+                other @ (Sharpness::Unknown | Sharpness::NoPeak) => other,
+            };
+            let pixel = self.to_image(DVec2::new(landmark.x, landmark.y));
+            Keypoint { pixel, confidence: landmark.confidence, sharpness }
         })
     }
 }

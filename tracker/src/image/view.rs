@@ -3,7 +3,7 @@
 use flyrig_types::Camera;
 use glam::{DMat3, DVec2, DVec3};
 
-use crate::landmarks::keypoints::{LANDMARK_COUNT, ViewKeypoints};
+use crate::landmarks::keypoints::{LANDMARK_COUNT, Sharpness, ViewKeypoints};
 
 /// Least depth of a point that is projected, metres.
 const NEAR_M: f64 = 0.1;
@@ -74,6 +74,8 @@ pub(crate) struct Observation {
     pub ideal_px: DVec2,
     /// Confidence of the network, 0..=1.
     pub confidence: f64,
+    /// Sharpness of the landmark's heatmap, axes of the image.
+    pub sharpness: Sharpness,
     /// Trust by age: 1 where the network ran on this very image, less where the landmark was carried along, 0..=1.
     pub trust: f64,
 }
@@ -91,6 +93,6 @@ pub(crate) fn observe(
             return None;
         }
         let ideal_px = view.undistorted(camera, keypoint.pixel)?;
-        Some(Observation { ideal_px, confidence: keypoint.confidence.min(1.0), trust: 1.0 })
+        Some(Observation { ideal_px, confidence: keypoint.confidence.min(1.0), sharpness: keypoint.sharpness, trust: 1.0 })
     })
 }

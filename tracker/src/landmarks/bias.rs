@@ -2,12 +2,13 @@
 //! named after.
 //!
 //! Both are measured on simulated people whose pose is known ([`LandmarkStudy`](crate::LandmarkStudy)). The fit places
-//! landmarks with their bias and divides residuals by their spread, which grows as the confidence falls.
+//! landmarks with their bias and divides residuals by their spread, which grows with the width of the heatmap's peak and as the
+//! confidence falls.
 
 use flyrig_body::Template;
-use glam::DVec3;
+use glam::{DVec2, DVec3};
 
-use crate::landmarks::keypoints::{LANDMARK_COUNT, NOSE};
+use crate::landmarks::keypoints::{LANDMARK_COUNT, NOSE, Sharpness};
 use crate::landmarks::surface_marks::BodyMark;
 
 /// Measurement of a landmark of the left side or the middle; the right side is its mirror image.
@@ -17,41 +18,85 @@ struct Measured {
     bias_mm: [f64; 3],
     /// Standard deviation about it in an image, millimetres at the body's depth.
     spread_mm: f64,
+    /// Median spread of its heatmap's peak, cells.
+    peak_cells: f64,
 }
 
 /// Biases and spreads as printed by `flyrig-bench landmarks` for eight simulated people (seeds 301 to 308, a motion each, 7
 /// cameras, 30 frames). The signs are anatomy: the network's hips lie at the outer hip bone, its shoulders on top of the
 /// joint.
 const MEASURED: [Measured; 17] = [
-    Measured { landmark: 0, bias_mm: [-4.0, 4.0, -10.0], spread_mm: 14.0 },
-    Measured { landmark: 1, bias_mm: [0.0, 0.0, -11.0], spread_mm: 13.0 },
-    Measured { landmark: 2, bias_mm: [-1.0, 0.0, -15.0], spread_mm: 13.0 },
-    Measured { landmark: 3, bias_mm: [-2.0, 0.0, -17.0], spread_mm: 13.0 },
-    Measured { landmark: 7, bias_mm: [-22.0, -11.0, 29.0], spread_mm: 14.0 },
-    Measured { landmark: 9, bias_mm: [-4.0, 3.0, -15.0], spread_mm: 13.0 },
-    Measured { landmark: 11, bias_mm: [-14.0, 34.0, -3.0], spread_mm: 18.0 },
-    Measured { landmark: 13, bias_mm: [2.0, -2.0, 2.0], spread_mm: 21.0 },
-    Measured { landmark: 15, bias_mm: [-8.0, -9.0, 9.0], spread_mm: 15.0 },
-    Measured { landmark: 17, bias_mm: [-12.0, 31.0, 0.0], spread_mm: 19.0 },
-    Measured { landmark: 19, bias_mm: [-1.0, 2.0, -28.0], spread_mm: 18.0 },
-    Measured { landmark: 21, bias_mm: [5.0, -16.0, -15.0], spread_mm: 18.0 },
-    Measured { landmark: 23, bias_mm: [-2.0, -27.0, 27.0], spread_mm: 24.0 },
-    Measured { landmark: 25, bias_mm: [2.0, -34.0, -30.0], spread_mm: 27.0 },
-    Measured { landmark: 27, bias_mm: [1.0, 20.0, 13.0], spread_mm: 18.0 },
-    Measured { landmark: 29, bias_mm: [-12.0, -6.0, 7.0], spread_mm: 25.0 },
-    Measured { landmark: 31, bias_mm: [-1.0, -7.0, -5.0], spread_mm: 28.0 },
+    Measured { landmark: 0, bias_mm: [-4.9, 8.4, -12.7], spread_mm: 12.6, peak_cells: 1.03 },
+    Measured { landmark: 1, bias_mm: [-3.1, 4.1, -8.8], spread_mm: 11.8, peak_cells: 0.97 },
+    Measured { landmark: 2, bias_mm: [-6.9, 4.0, -13.6], spread_mm: 12.5, peak_cells: 0.97 },
+    Measured { landmark: 3, bias_mm: [-10.7, 4.2, -15.0], spread_mm: 13.0, peak_cells: 0.99 },
+    Measured { landmark: 7, bias_mm: [-27.9, -6.8, 29.6], spread_mm: 10.6, peak_cells: 1.05 },
+    Measured { landmark: 9, bias_mm: [-7.4, 10.6, -9.8], spread_mm: 12.8, peak_cells: 0.99 },
+    Measured { landmark: 11, bias_mm: [-5.6, 34.0, -3.7], spread_mm: 13.9, peak_cells: 1.11 },
+    Measured { landmark: 13, bias_mm: [-3.5, 6.9, 5.1], spread_mm: 13.6, peak_cells: 1.20 },
+    Measured { landmark: 15, bias_mm: [-2.3, -3.2, 3.5], spread_mm: 10.0, peak_cells: 1.12 },
+    Measured { landmark: 17, bias_mm: [-16.9, 30.1, 1.7], spread_mm: 11.9, peak_cells: 1.16 },
+    Measured { landmark: 19, bias_mm: [-2.3, -1.3, -28.9], spread_mm: 11.5, peak_cells: 1.12 },
+    Measured { landmark: 21, bias_mm: [12.0, -15.3, -15.0], spread_mm: 12.2, peak_cells: 1.15 },
+    Measured { landmark: 23, bias_mm: [-6.8, -4.4, 26.5], spread_mm: 16.7, peak_cells: 1.17 },
+    Measured { landmark: 25, bias_mm: [-1.1, -16.1, -14.8], spread_mm: 17.8, peak_cells: 1.24 },
+    Measured { landmark: 27, bias_mm: [0.1, 21.0, 14.0], spread_mm: 13.3, peak_cells: 1.24 },
+    Measured { landmark: 29, bias_mm: [-10.8, -1.4, 8.8], spread_mm: 17.8, peak_cells: 1.35 },
+    Measured { landmark: 31, bias_mm: [2.5, 5.3, 4.8], spread_mm: 17.4, peak_cells: 1.36 },
 ];
 
-/// Confidence of a landmark, and its spread as a multiple of a sure one's (90 % lie within it), as printed by the same
-/// command for twelve further people (seeds 401 to 412): the network guesses hidden joints fairly well.
-const DOUBTS: [(f64, f64); 8] =
-    [(0.025, 7.4), (0.075, 4.6), (0.15, 4.4), (0.25, 3.6), (0.4, 2.5), (0.6, 1.6), (0.8, 1.2), (0.95, 1.0)];
+/// Spread of a heatmap's peak as a multiple of the landmark's median, and the spread of the landmark as a multiple of
+/// [`spread_m`], as printed by the same command.
+const BY_PEAK: Table = &[(0.86, 0.7), (0.94, 0.85), (1.0, 1.0), (1.08, 1.3), (1.17, 1.7), (1.26, 2.2), (1.42, 3.3), (1.6, 4.5)];
+/// Confidence of a landmark with a peak, and the factor of its spread that the peak does not explain.
+const BY_CONFIDENCE: Table = &[(0.05, 1.8), (0.2, 1.7), (0.5, 1.2), (0.8, 1.15), (0.95, 1.0)];
+/// The same for a landmark without a peak.
+const WITHOUT_PEAK: Table = &[(0.05, 6.3), (0.2, 6.3), (0.5, 4.5), (0.85, 3.5)];
+/// The same for a network without heatmaps (seeds 401 to 412): it guesses hidden joints fairly well.
+const WITHOUT_HEATMAP: Table =
+    &[(0.025, 7.4), (0.075, 4.6), (0.15, 4.4), (0.25, 3.6), (0.4, 2.5), (0.6, 1.6), (0.8, 1.2), (0.95, 1.0)];
+/// Ratio of a landmark's spreads along and across the wide direction of its peak, as a power of the peak's aspect, and the
+/// largest aspect that counts.
+const ASPECT_POWER: f64 = 2.4;
+const MOST_ASPECT: f64 = 1.5;
 
-/// Returns the standard deviation of a landmark of a confidence (0..=1) as a multiple of [`spread_m`].
-pub(crate) fn doubt(confidence: f64) -> f64 {
-    let after = DOUBTS.iter().position(|(at, _)| *at >= confidence).unwrap_or(DOUBTS.len() - 1).max(1);
-    let [(from, low), (to, high)] = [DOUBTS[after - 1], DOUBTS[after]];
-    low + (high - low) * ((confidence - from) / (to - from)).clamp(0.0, 1.0)
+/// Ascending arguments with their values.
+type Table = &'static [(f64, f64)];
+
+/// Interpolates a table; constant beyond its ends.
+fn interpolated(table: Table, at: f64) -> f64 {
+    let after = table.iter().position(|(end, _)| *end >= at).unwrap_or(table.len() - 1).max(1);
+    let [(from, low), (to, high)] = [table[after - 1], table[after]];
+    low + (high - low) * ((at - from) / (to - from)).clamp(0.0, 1.0)
+}
+
+/// Spread of an observed landmark, metres at the body's depth.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub(crate) struct Spread {
+    /// Principal directions in the image, unit vectors.
+    pub axes: [DVec2; 2],
+    /// Standard deviation along each.
+    pub sigma_m: [f64; 2],
+}
+
+/// Returns the spread of a landmark that was observed with a confidence (0..=1) and a sharpness.
+pub(crate) fn observed_spread(landmark: usize, confidence: f64, sharpness: Sharpness) -> Spread {
+    let (axes, spread) = ([DVec2::X, DVec2::Y], spread_m(landmark));
+    let round = |table| {
+        let sigma = spread * interpolated(table, confidence);
+        Spread { axes, sigma_m: [sigma; 2] }
+    };
+    match sharpness {
+        Sharpness::Unknown => round(WITHOUT_HEATMAP),
+        Sharpness::NoPeak => round(WITHOUT_PEAK),
+        Sharpness::Peak { spread_cells, along, aspect } => {
+            let usual = measured(landmark).map_or(1.1, |measured| measured.peak_cells);
+            let sigma =
+                spread * interpolated(BY_PEAK, spread_cells / usual) * interpolated(BY_CONFIDENCE, confidence);
+            let stretch = aspect.clamp(1.0, MOST_ASPECT).powf(0.5 * ASPECT_POWER);
+            Spread { axes: [along, along.perp()], sigma_m: [sigma * stretch, sigma / stretch] }
+        }
+    }
 }
 
 /// Moves the landmarks from their anatomical places to where the network points.

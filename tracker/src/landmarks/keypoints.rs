@@ -49,6 +49,27 @@ pub struct Keypoint {
     pub pixel: DVec2,
     /// 0 unusable (or unseen) to 1 certain.
     pub confidence: f64,
+    /// Sharpness of its heatmap.
+    pub sharpness: Sharpness,
+}
+
+/// Sharpness of the heatmap in which a network sees a landmark.
+#[derive(Debug, Clone, Copy, PartialEq, Default)]
+pub enum Sharpness {
+    /// The network has no heatmaps.
+    #[default]
+    Unknown,
+    /// The heatmap has no peak near the landmark.
+    NoPeak,
+    /// The heatmap has a peak.
+    Peak {
+        /// Standard deviation, cells of the heatmap.
+        spread_cells: f64,
+        /// Direction in which the peak is widest, a unit vector.
+        along: DVec2,
+        /// Width along that direction over the width across, 1 or more.
+        aspect: f64,
+    },
 }
 
 impl Keypoint {

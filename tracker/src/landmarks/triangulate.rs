@@ -53,7 +53,7 @@ pub struct WorldPoint {
 ///     .iter()
 ///     .map(|camera| {
 ///         let mut seen = [Keypoint::default(); LANDMARK_COUNT];
-///         seen[0] = Keypoint { pixel: camera.project(nose)?, confidence: 0.9 };
+///         seen[0] = Keypoint { pixel: camera.project(nose)?, confidence: 0.9, ..Default::default() };
 ///         Some(seen)
 ///     })
 ///     .collect();
@@ -232,9 +232,9 @@ mod tests {
     fn poisoned_landmarks_give_no_point_and_never_nan() {
         let rig = ring(3);
         let good = keypoints_of(&rig.cameras[0], &points());
-        let nan = [Keypoint { pixel: DVec2::NAN, confidence: 1.0 }; LANDMARK_COUNT];
-        let unsure = [Keypoint { pixel: DVec2::ZERO, confidence: f64::NAN }; LANDMARK_COUNT];
-        let far = [Keypoint { pixel: DVec2::splat(1e300), confidence: 1.0 }; LANDMARK_COUNT];
+        let nan = [Keypoint { pixel: DVec2::NAN, confidence: 1.0, ..Default::default() }; LANDMARK_COUNT];
+        let unsure = [Keypoint { pixel: DVec2::ZERO, confidence: f64::NAN, ..Default::default() }; LANDMARK_COUNT];
+        let far = [Keypoint { pixel: DVec2::splat(1e300), confidence: 1.0, ..Default::default() }; LANDMARK_COUNT];
         for keypoints in [
             vec![None, None, None],
             vec![Some(good), None, None],

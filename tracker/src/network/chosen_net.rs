@@ -74,7 +74,7 @@ impl ChosenNet {
         let landmark = |index: Option<usize>| {
             let (at, confidence) = *points.get(index?)?;
             let DVec2 { x, y } = crop.crop_from_image(wide.to_image_from(at + margin, long));
-            Some(CropLandmark { x, y, confidence, world: None })
+            Some(CropLandmark { x, y, confidence, ..CropLandmark::UNSEEN })
         };
         let landmarks = self.indices.map(|index| landmark(index).unwrap_or(CropLandmark::UNSEEN));
         // Presence is the mean of the better half: the others may be hidden, or out of the image.

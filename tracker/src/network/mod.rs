@@ -2,6 +2,7 @@
 
 mod chosen_net;
 mod depthwise;
+mod heatmap;
 pub(crate) mod landmark_net;
 mod network_file;
 pub(crate) mod output;

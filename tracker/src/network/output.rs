@@ -1,6 +1,6 @@
 //! Output of a pose network for one crop.
 
-use crate::landmarks::keypoints::LANDMARK_COUNT;
+use crate::landmarks::keypoints::{LANDMARK_COUNT, Sharpness};
 
 /// Side of the square crop that the built-in pose network takes, pixels.
 pub(crate) const NET_SIDE: usize = 256;
@@ -14,6 +14,8 @@ pub struct CropLandmark {
     pub y: f64,
     /// Smaller of the probabilities that the landmark is visible and that it lies in the crop.
     pub confidence: f64,
+    /// Sharpness of its heatmap, axes of the crop.
+    pub sharpness: Sharpness,
     /// Metres from the middle of the hips, axes of the crop: x right, y down, z away from the camera; `None` where the
     /// network gives no depth.
     pub world: Option<[f64; 3]>,
@@ -21,7 +23,8 @@ pub struct CropLandmark {
 
 impl CropLandmark {
     /// Landmark that the network does not give.
-    pub(crate) const UNSEEN: Self = Self { x: f64::NAN, y: f64::NAN, confidence: 0.0, world: None };
+    pub(crate) const UNSEEN: Self =
+        Self { x: f64::NAN, y: f64::NAN, confidence: 0.0, sharpness: Sharpness::Unknown, world: None };
 }
 
 /// Output for one crop.

@@ -5,8 +5,9 @@ use std::path::Path;
 use crate::error::TrackError;
 use crate::image::crop::Crop;
 use crate::image::pixels::Rgb;
-use crate::landmarks::keypoints::LANDMARK_COUNT;
+use crate::landmarks::keypoints::{LANDMARK_COUNT, Sharpness};
 use crate::network::chosen_net::ChosenNet;
+use crate::network::heatmap::{HEATMAP_SIDE, Heatmaps};
 use crate::network::landmark_net::{LandmarkNet, LoadedNet, sigmoid};
 use crate::network::output::{CropLandmark, NET_SIDE, NetOutput};
 
@@ -15,6 +16,8 @@ const LANDMARK_STRIDE: usize = 5;
 /// Landmarks of BlazePose: 33 of the body, and 6 helpers of the original's tracking that are not used.
 const NET_LANDMARKS: usize = 39;
 
+/// Pixels of the crop per cell of a heatmap.
+const PX_PER_CELL: f64 = (NET_SIDE / HEATMAP_SIDE) as f64;
 /// Numbers of BlazePose's mask.
 const MASK_SIZE: usize = NET_SIDE * NET_SIDE;
 
@@ -118,17 +121,22 @@ fn run_blazepose(net: &LandmarkNet, rgb: &[f32], has_mask: bool) -> Result<NetOu
     let find = |count| outputs.of_size(count);
     let raw = find(NET_LANDMARKS * LANDMARK_STRIDE)?;
     let world = find(NET_LANDMARKS * 3)?;
+    let heatmaps = find(NET_LANDMARKS * HEATMAP_SIDE * HEATMAP_SIDE)?;
+    let heatmaps = Heatmaps::new(&heatmaps, NET_LANDMARKS);
     let presence = f64::from(find(1)?[0]).clamp(0.0, 1.0);
     let logits = has_mask.then(|| find(MASK_SIZE)).transpose()?;
     let mask = logits.map(|logits| logits.into_iter().map(|logit| 1.0 / (1.0 + (-logit).exp())).collect());
     let mut landmarks = [CropLandmark::default(); LANDMARK_COUNT];
     for (i, landmark) in landmarks.iter_mut().enumerate() {
         let [x, y, _, visible, present] = std::array::from_fn(|k| f64::from(raw[i * LANDMARK_STRIDE + k]));
+        let peak = heatmaps.as_ref().and_then(|maps| maps.peak(i, [x, y].map(|at| at / PX_PER_CELL)));
+        let [x, y] = peak.map_or([x, y], |peak| peak.at.map(|at| at * PX_PER_CELL));
         *landmark = CropLandmark {
             // The network's coordinates have pixel corners at integers.
             x: x - 0.5,
             y: y - 0.5,
             confidence: sigmoid(visible).min(sigmoid(present)),
+            sharpness: peak.map_or(Sharpness::NoPeak, |peak| peak.sharpness()),
             world: Some(std::array::from_fn(|k| f64::from(world[i * 3 + k]))),
         };
     }

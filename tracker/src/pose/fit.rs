@@ -13,7 +13,7 @@ use glam::{DMat3, DVec3};
 use nalgebra::DVector;
 
 use crate::image::view::{Observation, View};
-use crate::landmarks::bias::{doubt, spread_m};
+use crate::landmarks::bias::{Spread, observed_spread};
 use crate::landmarks::keypoints::LANDMARK_COUNT;
 use crate::pose::body_model::{BodyModel, JointTurns, PosedSkeleton};
 use crate::pose::line_point::{LineKind, LinePoint};
@@ -124,14 +124,15 @@ impl FitProblem<'_> {
                 let moved = mark + view.shift[landmark];
                 let Some((pixel, rows)) = view.view.project_with_derivative(moved) else { continue };
                 let Some(px_per_m) = view.view.px_per_m(posed.origin[0]) else { continue };
-                let spread_m = spread_m(landmark) * doubt(seen.confidence);
-                let inverse_sigma = 1.0 / (self.landmark_spread * spread_m * px_per_m);
-                let error = (pixel - seen.ideal_px) * inverse_sigma;
+                let Spread { axes, sigma_m } = observed_spread(landmark, seen.confidence, seen.sharpness);
+                let inverse_sigmas = sigma_m.map(|sigma_m| 1.0 / (self.landmark_spread * sigma_m * px_per_m));
+                let away = pixel - seen.ideal_px;
+                let errors = [0, 1].map(|k| away.dot(axes[k]) * inverse_sigmas[k]);
                 let trust = LANDMARK_WEIGHT[landmark] * seen.trust * seen.trust;
-                let (cost, weight) = kernel.weigh(error.length_squared(), trust);
+                let (cost, weight) = kernel.weigh(errors[0] * errors[0] + errors[1] * errors[1], trust);
                 term.cost += cost;
-                for (row, e) in rows.into_iter().zip([error.x, error.y]) {
-                    term.add(row * inverse_sigma, e, weight);
+                for ((axis, inverse_sigma), error) in axes.into_iter().zip(inverse_sigmas).zip(errors) {
+                    term.add((rows[0] * axis.x + rows[1] * axis.y) * inverse_sigma, error, weight);
                 }
                 any = true;
             }
