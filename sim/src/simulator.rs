@@ -57,7 +57,8 @@ impl Simulator {
         let rig = camera_ring(config)?;
         let cast = Cast::new(config)?;
         let people: Vec<&Person> = cast.actors().map(|actor| &actor.person).collect();
-        let drawing = Drawing::new(&gpu.with_adapter()?, [config.width, config.height], Scene::new(config, &rig), &people)?;
+        let drawing =
+            Drawing::new(&gpu.with_adapter()?, [config.width, config.height], Scene::new(config, &rig), &people)?;
         let cameras = rig.cameras.iter().map(|_| Kept::default()).collect();
         let mut new = Self { config: config.clone(), rig, cast, plates: Vec::new(), drawing, posed: None, cameras };
         for slot in 0..new.rig.cameras.len() {

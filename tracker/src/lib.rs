@@ -39,7 +39,7 @@ pub use hands::tracker::{HandConfig, HandTracker};
 pub use image::pixels::is_blank;
 pub use landmarks::keypoints::{Keypoint, LANDMARK_COUNT, LANDMARK_NAMES, Sharpness, ViewKeypoints};
 pub use landmarks::presence::shows_person;
-pub use landmarks::study::{ConfidenceSpread, LandmarkBias, LandmarkStudy};
+pub use landmarks::study::{LandmarkBias, LandmarkStudy, RelativeSpread, SpreadBy};
 pub use landmarks::triangulate::{WorldPoint, triangulate};
 pub use masks::background::Background;
 pub use masks::background_event::BackgroundEvent;

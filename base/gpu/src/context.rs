@@ -4,8 +4,8 @@ use std::sync::{Arc, Mutex};
 
 use flyrig_types::lock;
 use wgpu::{
-    Adapter, AdapterInfo, BackendOptions, Backends, Device, DeviceType, Features, Instance, InstanceDescriptor,
-    Limits, NoopBackendOptions, Queue,
+    Adapter, AdapterInfo, BackendOptions, Backends, Device, DeviceType, Features, Instance, InstanceDescriptor, Limits,
+    NoopBackendOptions, Queue,
 };
 
 use crate::{GpuError, GpuObjects, shared::Shared};
@@ -71,11 +71,8 @@ impl GpuContext {
 
     /// Creates a context without an adapter: wgpu's backend that does nothing stands in, and kernels run on the processor.
     async fn without_adapter() -> Result<Self, GpuError> {
-        let limits = Limits {
-            max_buffer_size: MOST_BYTES,
-            max_storage_buffer_binding_size: MOST_BYTES,
-            ..Limits::unlimited()
-        };
+        let limits =
+            Limits { max_buffer_size: MOST_BYTES, max_storage_buffer_binding_size: MOST_BYTES, ..Limits::unlimited() };
         let noop = NoopBackendOptions { enable: true, limits: Some(limits), ..NoopBackendOptions::default() };
         let instance = Instance::new(InstanceDescriptor {
             backends: Backends::NOOP,
@@ -317,7 +314,9 @@ mod tests {
     #[test]
     fn arrays_need_no_adapter() {
         let gpu = without_adapter();
-        assert!(gpu.is_on_processor() && gpu.fastest().is_on_processor() && gpu.adapter_name().starts_with("processor"));
+        assert!(
+            gpu.is_on_processor() && gpu.fastest().is_on_processor() && gpu.adapter_name().starts_with("processor")
+        );
         let values = StorageBuffer::from_slice(&gpu, "values", &[1.0f32, 2.0, 3.0]).unwrap();
         let mut encoder = gpu.device.create_command_encoder(&Default::default());
         values.encode_write(&gpu, &mut encoder, &[4.0, 5.0]);

@@ -93,6 +93,11 @@ pub(crate) fn observe(
             return None;
         }
         let ideal_px = view.undistorted(camera, keypoint.pixel)?;
-        Some(Observation { ideal_px, confidence: keypoint.confidence.min(1.0), sharpness: keypoint.sharpness, trust: 1.0 })
+        Some(Observation {
+            ideal_px,
+            confidence: keypoint.confidence.min(1.0),
+            sharpness: keypoint.sharpness,
+            trust: 1.0,
+        })
     })
 }

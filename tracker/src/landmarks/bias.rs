@@ -22,8 +22,8 @@ struct Measured {
     peak_cells: f64,
 }
 
-/// Biases and spreads as printed by `flyrig-bench landmarks` for eight simulated people (seeds 301 to 308, a motion each, 7
-/// cameras, 30 frames). The signs are anatomy: the network's hips lie at the outer hip bone, its shoulders on top of the
+/// Biases and spreads as printed by `flyrig-bench landmarks` for eight simulated people (seeds 321 to 328, a motion each, 7
+/// cameras, 12 frames). The signs are anatomy: the network's hips lie at the outer hip bone, its shoulders on top of the
 /// joint.
 const MEASURED: [Measured; 17] = [
     Measured { landmark: 0, bias_mm: [-4.9, 8.4, -12.7], spread_mm: 12.6, peak_cells: 1.03 },
@@ -46,8 +46,9 @@ const MEASURED: [Measured; 17] = [
 ];
 
 /// Spread of a heatmap's peak as a multiple of the landmark's median, and the spread of the landmark as a multiple of
-/// [`spread_m`], as printed by the same command.
-const BY_PEAK: Table = &[(0.86, 0.7), (0.94, 0.85), (1.0, 1.0), (1.08, 1.3), (1.17, 1.7), (1.26, 2.2), (1.42, 3.3), (1.6, 4.5)];
+/// [`spread_m`], between those that the same command prints for these people and for two recorded bodies.
+const BY_PEAK: Table =
+    &[(0.86, 0.7), (0.94, 0.85), (1.0, 1.0), (1.08, 1.3), (1.17, 1.7), (1.26, 2.2), (1.42, 3.3), (1.6, 4.5)];
 /// Confidence of a landmark with a peak, and the factor of its spread that the peak does not explain.
 const BY_CONFIDENCE: Table = &[(0.05, 1.8), (0.2, 1.7), (0.5, 1.2), (0.8, 1.15), (0.95, 1.0)];
 /// The same for a landmark without a peak.
@@ -68,6 +69,11 @@ fn interpolated(table: Table, at: f64) -> f64 {
     let after = table.iter().position(|(end, _)| *end >= at).unwrap_or(table.len() - 1).max(1);
     let [(from, low), (to, high)] = [table[after - 1], table[after]];
     low + (high - low) * ((at - from) / (to - from)).clamp(0.0, 1.0)
+}
+
+/// Returns the spread of a landmark as a multiple of [`spread_m`], by that of its heatmap's peak as a multiple of the median.
+pub(crate) fn by_peak(relative: f64) -> f64 {
+    interpolated(BY_PEAK, relative)
 }
 
 /// Spread of an observed landmark, metres at the body's depth.
@@ -91,8 +97,7 @@ pub(crate) fn observed_spread(landmark: usize, confidence: f64, sharpness: Sharp
         Sharpness::NoPeak => round(WITHOUT_PEAK),
         Sharpness::Peak { spread_cells, along, aspect } => {
             let usual = measured(landmark).map_or(1.1, |measured| measured.peak_cells);
-            let sigma =
-                spread * interpolated(BY_PEAK, spread_cells / usual) * interpolated(BY_CONFIDENCE, confidence);
+            let sigma = spread * by_peak(spread_cells / usual) * interpolated(BY_CONFIDENCE, confidence);
             let stretch = aspect.clamp(1.0, MOST_ASPECT).powf(0.5 * ASPECT_POWER);
             Spread { axes: [along, along.perp()], sigma_m: [sigma * stretch, sigma / stretch] }
         }
@@ -153,5 +158,37 @@ mod tests {
             assert_eq!(is_right(landmark), landmark != left);
         }
         assert!((0..LANDMARK_COUNT).all(|landmark| measured(landmark).is_some() && spread_m(landmark) > 0.005));
+    }
+
+    #[test]
+    fn tables_are_interpolated_and_constant_beyond_their_ends() {
+        const TABLE: Table = &[(0.0, 4.0), (0.5, 2.0), (1.0, 1.0)];
+        for (at, expected) in [(-1.0, 4.0), (0.25, 3.0), (0.5, 2.0), (0.9, 1.2), (1.0, 1.0), (7.0, 1.0)] {
+            assert!((interpolated(TABLE, at) - expected).abs() < 1e-12, "{at}");
+        }
+        assert!(interpolated(TABLE, f64::NAN).is_nan());
+        for table in [BY_CONFIDENCE, WITHOUT_PEAK, WITHOUT_HEATMAP] {
+            assert!(table.is_sorted_by(|a, b| a.0 < b.0 && a.1 >= b.1), "sure landmarks spread least");
+        }
+        assert!(BY_PEAK.is_sorted_by(|a, b| a.0 < b.0 && a.1 < b.1), "sharp peaks spread least");
+    }
+
+    #[test]
+    fn a_sharp_peak_is_trusted_more_and_most_across_it() {
+        let of = |spread_cells, aspect| {
+            let sharpness = Sharpness::Peak { spread_cells, along: DVec2::Y, aspect };
+            observed_spread(15, 0.95, sharpness).sigma_m
+        };
+        let [usual, across] = of(1.12, 1.0);
+        assert!((usual - across).abs() < 1e-12 && (usual - spread_m(15)).abs() < 1e-12, "{usual}");
+        assert!(of(0.9, 1.0)[0] < 0.8 * usual && of(1.8, 1.0)[0] > 4.0 * usual);
+        let [along, across] = of(1.12, 1.2);
+        assert!(
+            (along / across - 1.2f64.powf(ASPECT_POWER)).abs() < 1e-9 && (along * across - usual * usual).abs() < 1e-9
+        );
+        assert_eq!(of(1.12, 9.0).map(f64::to_bits), of(1.12, MOST_ASPECT).map(f64::to_bits));
+        let at = |sharpness| observed_spread(15, 0.5, sharpness).sigma_m[0];
+        let peak = Sharpness::Peak { spread_cells: 1.12, along: DVec2::X, aspect: 1.0 };
+        assert!(at(peak) < at(Sharpness::Unknown) && at(Sharpness::Unknown) < at(Sharpness::NoPeak));
     }
 }

@@ -1,6 +1,8 @@
 //! Measures the pose network's bias and spread on people whose pose is known; its tables are those of
 //! [`bias`](crate::landmarks::bias).
 
+use std::collections::BTreeMap;
+
 use flyrig_body::Template;
 use flyrig_types::{Camera, Image, Pose};
 use glam::{DMat3, DVec2, DVec3};
@@ -8,9 +10,9 @@ use glam::{DMat3, DVec2, DVec3};
 use crate::error::TrackError;
 use crate::image::crop::Crop;
 use crate::image::pixels::Rgb;
-use crate::image::view::{View, observe};
-use crate::landmarks::bias::{is_right, left_of, template_scale};
-use crate::landmarks::keypoints::LANDMARK_COUNT;
+use crate::image::view::{Observation, View, observe};
+use crate::landmarks::bias::{by_peak, is_right, left_of, template_scale};
+use crate::landmarks::keypoints::{LANDMARK_COUNT, Sharpness};
 use crate::landmarks::search::project_all;
 use crate::landmarks::sighting::Sighting;
 use crate::network::pose_net::PoseNet;
@@ -20,8 +22,9 @@ use crate::pose::body_model::BodyModel;
 /// the wrong side.
 const SURE: f64 = 0.3;
 const GROSS_M: f64 = 0.15;
-/// Upper ends of the ranges of confidence whose spread is measured.
-const RANGES: [f64; 8] = [0.05, 0.1, 0.2, 0.3, 0.5, 0.7, 0.9, 1.0];
+/// Upper ends of the ranges of confidence, and of the relative width of a peak, whose spread is measured.
+const CONFIDENCES: [f64; 6] = [0.1, 0.3, 0.5, 0.7, 0.9, 1.0];
+const PEAKS: [f64; 8] = [0.9, 0.97, 1.03, 1.12, 1.21, 1.33, 1.5, 9.0];
 /// Rounds of reweighting, and the distance that loses half its weight, metres.
 const ROUNDS: usize = 20;
 const ROBUST_M: f64 = 0.03;
@@ -33,12 +36,21 @@ struct Sample {
     rows: [DVec3; 2],
     error: DVec2,
     confidence: f64,
+    sharpness: Sharpness,
 }
 
 impl Sample {
     /// Returns the squared distance from the place that a bias predicts, square metres.
     fn square(&self, bias: DVec3) -> f64 {
         (self.error - DVec2::new(self.rows[0].dot(bias), self.rows[1].dot(bias))).length_squared()
+    }
+
+    /// Returns the spread of the heatmap's peak, cells.
+    fn peak_cells(&self) -> Option<f64> {
+        match self.sharpness {
+            Sharpness::Peak { spread_cells, .. } => Some(spread_cells),
+            Sharpness::NoPeak | Sharpness::Unknown => None,
+        }
     }
 
     /// Whether the landmark is surely this one, and visible.
@@ -64,6 +76,8 @@ pub struct LandmarkBias {
     pub bias_m: DVec3,
     /// Standard deviation about it in an image, metres at the body's depth.
     pub spread_m: f64,
+    /// Median spread of its heatmap's peak, cells; `None` for a network without heatmaps.
+    pub peak_cells: Option<f64>,
     /// Number of observations.
     pub count: usize,
 }
@@ -98,7 +112,8 @@ impl LandmarkStudy {
             let to_camera = view.rotation * DMat3::from_quat(posed.rotation[model.marks[landmark].joint]) * metres;
             let mirror = |row: DVec3| if is_right(landmark) { DVec3::new(-row.x, row.y, row.z) } else { row };
             let rows = [to_camera.row(0), to_camera.row(1)].map(mirror);
-            self.samples[left_of(landmark)].push(Sample { rows, error, confidence: seen.confidence });
+            let Observation { confidence, sharpness, .. } = *seen;
+            self.samples[left_of(landmark)].push(Sample { rows, error, confidence, sharpness });
         }
         Ok(())
     }
@@ -130,46 +145,67 @@ impl LandmarkStudy {
             let mut squares: Vec<f64> = samples.iter().map(|sample| sample.square(bias)).collect();
             // The median square of a two-dimensional Gaussian is 2 ln 2 variances.
             let spread_m = (flyrig_solve::median(&mut squares)? / (2.0 * std::f64::consts::LN_2)).sqrt();
+            let mut peaks: Vec<f64> = samples.iter().filter_map(|sample| sample.peak_cells()).collect();
             (bias.is_finite() && spread_m.is_finite()).then_some(LandmarkBias {
                 landmark,
                 bias_m: bias,
                 spread_m,
+                peak_cells: flyrig_solve::median(&mut peaks),
                 count: samples.len(),
             })
         };
         self.samples.iter().enumerate().filter_map(fit).collect()
     }
 
-    /// Returns the growth of the spread with falling confidence, by ranges of confidence from low to high.
+    /// Returns the spread by the width of the heatmap's peak, by the confidence beyond that, and by the confidence without a
+    /// peak.
     #[must_use]
-    pub fn spreads(&self) -> Vec<ConfidenceSpread> {
-        let mut relative: [Vec<f64>; RANGES.len()] = Default::default();
+    pub fn spreads(&self) -> Vec<RelativeSpread> {
+        let mut found: BTreeMap<(SpreadBy, usize), Vec<f64>> = BTreeMap::new();
         for habit in self.biases() {
             for sample in &self.samples[habit.landmark] {
-                let range = RANGES.iter().position(|end| sample.confidence <= *end).unwrap_or(RANGES.len() - 1);
-                relative[range].push(sample.square(habit.bias_m) / (habit.spread_m * habit.spread_m));
+                let relative = sample.square(habit.bias_m).sqrt() / habit.spread_m;
+                let range = |ends: &[f64], at: f64| ends.iter().position(|end| at <= *end).unwrap_or(ends.len() - 1);
+                let by_confidence = range(&CONFIDENCES, sample.confidence);
+                match sample.peak_cells().zip(habit.peak_cells) {
+                    Some((own, usual)) => {
+                        found.entry((SpreadBy::Peak, range(&PEAKS, own / usual))).or_default().push(relative);
+                        let explained = by_peak(own / usual);
+                        found.entry((SpreadBy::Confidence, by_confidence)).or_default().push(relative / explained);
+                    }
+                    None => found.entry((SpreadBy::ConfidenceAlone, by_confidence)).or_default().push(relative),
+                }
             }
         }
-        let nine_tenths = |relative: &mut Vec<f64>| {
-            relative.sort_by(f64::total_cmp);
-            relative.get(relative.len() * 9 / 10).map(|square| square.sqrt())
+        let row = |((by, range), mut values): ((SpreadBy, usize), Vec<f64>)| {
+            let up_to = if by == SpreadBy::Peak { PEAKS[range] } else { CONFIDENCES[range] };
+            // The median distance of a two-dimensional Gaussian is the square root of 2 ln 2 standard deviations.
+            let times = flyrig_solve::median(&mut values)? / (2.0 * std::f64::consts::LN_2).sqrt();
+            Some(RelativeSpread { by, up_to, times, count: values.len() })
         };
-        let spreads = relative.each_mut().map(nine_tenths);
-        let Some(sure) = spreads[RANGES.len() - 1] else { return Vec::new() };
-        let counts = relative.iter().map(Vec::len);
-        let ranges = RANGES.into_iter().zip(spreads).zip(counts);
-        ranges
-            .filter_map(|((up_to, spread), count)| Some(ConfidenceSpread { up_to, times: spread? / sure, count }))
-            .collect()
+        found.into_iter().filter_map(row).collect()
     }
 }
 
-/// Spread of landmarks of a range of confidence.
+/// Grouping of landmarks whose spreads are compared.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord)]
+pub enum SpreadBy {
+    /// By the width of the heatmap's peak, relative to the landmark's median.
+    Peak,
+    /// By confidence, of landmarks with a peak and relative to what the peak explains.
+    Confidence,
+    /// By confidence, of landmarks without a peak.
+    ConfidenceAlone,
+}
+
+/// Spread of a group of landmarks.
 #[derive(Debug, Clone, Copy, PartialEq)]
-pub struct ConfidenceSpread {
-    /// Upper end of the range, 0..=1.
+pub struct RelativeSpread {
+    /// Grouping.
+    pub by: SpreadBy,
+    /// Upper end of the group's range.
     pub up_to: f64,
-    /// Distance within which 90 % lie, as a multiple of that of the surest range.
+    /// Standard deviation as a multiple of the landmark's own ([`LandmarkBias::spread_m`]).
     pub times: f64,
     /// Number of observations.
     pub count: usize,
@@ -178,7 +214,6 @@ pub struct ConfidenceSpread {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::landmarks::bias::doubt;
 
     #[test]
     fn a_bias_is_found_from_several_directions_in_spite_of_outliers() {
@@ -194,6 +229,7 @@ mod tests {
                 rows,
                 error: DVec2::new(rows[0].dot(bias), rows[1].dot(bias)) + noise + outlier,
                 confidence: 0.9,
+                sharpness: Sharpness::Unknown,
             });
         }
         let habits = study.biases();
@@ -206,32 +242,48 @@ mod tests {
     }
 
     #[test]
-    fn doubt_is_measured_by_confidence_and_grows_as_that_falls() {
+    fn spreads_are_told_apart_by_peak_and_confidence() {
         let mut study = LandmarkStudy::new(PoseNet::embedded().unwrap());
-        for k in 0..400 {
+        let wide = |times: f64| Sharpness::Peak { spread_cells: times, along: DVec2::X, aspect: 1.0 };
+        for k in 0..1000 {
             let turn = DMat3::from_rotation_y(f64::from(k) * 0.7) * DMat3::from_rotation_x(f64::from(k) * 0.3);
             let noise = DVec2::new(f64::from(k % 7) - 3.0, f64::from(k % 5) - 2.0) * 1e-3;
-            let (confidence, times) = if k % 2 == 0 { (0.95, 1.0) } else { (0.15, 5.0) };
-            study.samples[13].push(Sample { rows: [turn.row(0), turn.row(1)], error: noise * times, confidence });
+            let (confidence, sharpness, times) = match k % 20 {
+                0 => (0.95, Sharpness::NoPeak, 6.0),
+                1..=2 => (0.95, wide(1.42), by_peak(1.42)),
+                3..=4 => (0.2, wide(1.0), 1.7),
+                _ => (0.95, wide(1.0), 1.0),
+            };
+            let (rows, error) = ([turn.row(0), turn.row(1)], noise * times);
+            study.samples[13].push(Sample { rows, error, confidence, sharpness });
         }
-        let doubts = study.spreads();
-        let [low, high] = doubts.as_slice() else { panic!("{doubts:?}") };
-        assert_eq!((low.up_to, low.count, high.up_to, high.count), (0.2, 200, 1.0, 200));
-        assert!((low.times - 5.0).abs() < 0.3 && (high.times - 1.0).abs() < 1e-12, "{doubts:?}");
+        assert_eq!(study.biases()[0].peak_cells, Some(1.0));
+        let spreads = study.spreads();
+        let of = |by, up_to: f64| spreads.iter().find(|row| row.by == by && (row.up_to - up_to).abs() < 1e-9).unwrap();
+        let usual = of(SpreadBy::Peak, 1.03).times;
+        for (row, expected, count) in [
+            (of(SpreadBy::Peak, 1.5), by_peak(1.42), 100),
+            (of(SpreadBy::Confidence, 0.3), 1.7, 100),
+            (of(SpreadBy::ConfidenceAlone, 1.0), 6.0, 50),
+        ] {
+            assert_eq!(row.count, count, "{row:?}");
+            assert!((row.times / usual - expected).abs() < 0.25 * expected, "{row:?} {usual}");
+        }
         assert!(LandmarkStudy::new(PoseNet::embedded().unwrap()).spreads().is_empty());
-        for (a, b) in [(0.0, 0.1), (0.1, 0.3), (0.3, 0.5), (0.5, 0.9)] {
-            assert!(doubt(a) > doubt(b), "{a} {b}");
-        }
-        for (confidence, least) in [(1.0, 1.0), (5.0, 1.0), (0.0, doubt(0.025)), (-1.0, doubt(0.025))] {
-            assert!((doubt(confidence) - least).abs() < 1e-12, "{confidence}");
-        }
-        assert!(doubt(f64::NAN).is_nan());
     }
 
     #[test]
     fn one_direction_alone_says_nothing_of_depth() {
         let mut study = LandmarkStudy::new(PoseNet::embedded().unwrap());
-        study.samples[11] = vec![Sample { rows: [DVec3::X, DVec3::Y], error: DVec2::ZERO, confidence: 0.9 }; 100];
+        study.samples[11] = vec![
+            Sample {
+                rows: [DVec3::X, DVec3::Y],
+                error: DVec2::ZERO,
+                confidence: 0.9,
+                sharpness: Sharpness::Unknown
+            };
+            100
+        ];
         assert!(study.biases().is_empty());
     }
 }

@@ -59,7 +59,7 @@ mod tests {
     const SIDE: usize = 64;
 
     fn image(side: usize, paint: impl Fn(usize, usize) -> u8) -> Image {
-        let bytes = (0..side * side).flat_map(|at| [paint(at % side, at / side); 3]).collect();
+        let bytes: Vec<u8> = (0..side * side).flat_map(|at| [paint(at % side, at / side); 3]).collect();
         Image::new(side as u32, side as u32, PixelFormat::Rgb8, bytes).unwrap()
     }
 

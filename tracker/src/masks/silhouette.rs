@@ -187,13 +187,11 @@ mod tests {
             body.values[y * 90 + 40..y * 90 + 44].fill(1.0);
         }
         let gate = BodyGate::of_grid(&body, 30.0);
-        let near: Vec<[usize; 2]> = (0..90 * 60)
-            .filter(|&at| gate.distance.values[at] < gate.reach)
-            .map(|at| [at % 90, at / 90])
-            .collect();
-        let [low, high] = [0, 1].map(|k| (near.iter().map(|at| at[k]).min(), near.iter().map(|at| at[k]).max())).map(
-            |(low, high)| [low.unwrap(), high.unwrap() + 1],
-        );
+        let near: Vec<[usize; 2]> =
+            (0..90 * 60).filter(|&at| gate.distance.values[at] < gate.reach).map(|at| [at % 90, at / 90]).collect();
+        let [low, high] = [0, 1]
+            .map(|k| (near.iter().map(|at| at[k]).min(), near.iter().map(|at| at[k]).max()))
+            .map(|(low, high)| [low.unwrap(), high.unwrap() + 1]);
         assert!(near.len() < 90 * 60 && low[0] > 3 && high[0] > 3, "the margin fits on every side");
         assert_eq!(reached(&gate, 0), Some([low[0], high[0], low[1], high[1]]));
         assert_eq!(reached(&gate, 3), Some([low[0] - 3, high[0] - 3, low[1] + 3, high[1] + 3]));

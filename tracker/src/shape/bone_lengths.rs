@@ -275,7 +275,9 @@ mod tests {
     fn no_views_one_view_and_poison_are_lost_not_nan() {
         let template = body();
         let rig = ring(2);
-        let nan = [crate::landmarks::keypoints::Keypoint { pixel: glam::DVec2::NAN, confidence: 1.0, ..Default::default() }; LANDMARK_COUNT];
+        let nan =
+            [crate::landmarks::keypoints::Keypoint { pixel: glam::DVec2::NAN, confidence: 1.0, ..Default::default() };
+                LANDMARK_COUNT];
         let points = [DVec3::new(0.0, 0.0, 1.0); LANDMARK_COUNT];
         let one_point = [0, 1].map(|i| Some(keypoints_of(&rig.cameras[i], &points))).to_vec();
         for keypoints in [vec![], vec![vec![None, None]], vec![vec![Some(nan), Some(nan)]], vec![one_point]] {

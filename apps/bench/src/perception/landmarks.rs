@@ -11,7 +11,7 @@ use flyrig_capture::{FolderOptions, FolderReplay};
 use flyrig_fusion::next_frame;
 use flyrig_report::{arguments::FpsArgs, progress_bar};
 use flyrig_takes::dataset;
-use flyrig_tracker::{ConfidenceSpread, LANDMARK_NAMES, LandmarkStudy, PoseNet};
+use flyrig_tracker::{LANDMARK_NAMES, LandmarkStudy, PoseNet, RelativeSpread, SpreadBy};
 
 /// Arguments of the command.
 #[derive(Debug, Args)]
@@ -50,15 +50,27 @@ pub fn landmarks(args: &BenchLandmarksArgs) -> Result<()> {
         }
         bar.finish_and_clear();
     }
-    println!("{:>3} {:<20} {:>7} {:>7} {:>7} {:>8} {:>6}", "", "landmark", "x mm", "y mm", "z mm", "spread", "seen");
+    println!(
+        "{:>3} {:<20} {:>7} {:>7} {:>7} {:>8} {:>6} {:>6}",
+        "", "landmark", "x mm", "y mm", "z mm", "spread", "peak", "seen"
+    );
     for bias in study.biases() {
         let [x, y, z] = (bias.bias_m * 1e3).to_array();
         let (name, spread) = (LANDMARK_NAMES[bias.landmark], bias.spread_m * 1e3);
-        println!("{:>3} {name:<20} {x:>7.1} {y:>7.1} {z:>7.1} {spread:>8.1} {:>6}", bias.landmark, bias.count);
+        let peak = bias.peak_cells.map_or("-".to_owned(), |cells| format!("{cells:.2}"));
+        println!(
+            "{:>3} {name:<20} {x:>7.1} {y:>7.1} {z:>7.1} {spread:>8.1} {peak:>6} {:>6}",
+            bias.landmark, bias.count
+        );
     }
-    println!("\nspread of less certain landmarks, as a multiple of the above");
-    for ConfidenceSpread { up_to, times, count } in study.spreads() {
-        println!("confidence up to {up_to:.2} {times:>6.2} {count:>6}");
+    println!("\nspread as a multiple of the above");
+    for RelativeSpread { by, up_to, times, count } in study.spreads() {
+        let by = match by {
+            SpreadBy::Peak => "peak, over its median, up to",
+            SpreadBy::Confidence => "confidence beside a peak, up to",
+            SpreadBy::ConfidenceAlone => "confidence without a peak, up to",
+        };
+        println!("{by:<32} {up_to:.2} {times:>6.2} {count:>6}");
     }
     Ok(())
 }
