@@ -17,8 +17,7 @@ pub struct PoseConfig {
     pub confidence_threshold: f64,
     /// Largest residual at which a view agrees on a landmark, metres at its depth.
     pub inlier_m: f64,
-    /// Standard deviation of the landmarks, as a multiple of that measured on simulated people: views share a part of their
-    /// errors, which are a person's own.
+    /// Standard deviation of the landmarks, as a multiple of that measured on simulated people.
     pub landmark_spread: f64,
     /// Standard deviation of the body's outline from the mask's (clothes, the body's shape), metres.
     pub outline_sigma_m: f64,
@@ -51,7 +50,7 @@ impl Default for PoseConfig {
             presence_threshold: 0.5,
             confidence_threshold: 0.3,
             inlier_m: 0.07,
-            landmark_spread: 1.4,
+            landmark_spread: 1.0,
             outline_sigma_m: 0.01,
             outline_rounds: 2,
             shape_rounds: 2,
