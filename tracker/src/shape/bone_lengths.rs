@@ -133,7 +133,7 @@ pub(crate) fn fit_template_shape(
         }
         sets += usize::from(any);
     }
-    let rest = |a: usize, b: usize| (model.marks[a].point - model.marks[b].point).length();
+    let rest = usual_lengths(&model);
     // Ratio of measured to template length, and the number of measurements.
     let ratios: Vec<Option<(f64, f64)>> = GROUPS
         .iter()
@@ -193,6 +193,32 @@ pub(crate) fn fit_template_shape(
     Ok((shaped, fit))
 }
 
+/// Returns the median distance of two landmarks over poses that fill the joints' ranges evenly: a landmark that lies beside its
+/// joint moves with one of the bones that meet there, so that its distance from the next one depends on the pose.
+fn usual_lengths(model: &BodyModel) -> impl Fn(usize, usize) -> f64 {
+    /// Number of poses, and the inverse of the golden ratio, whose multiples fill 0..1 evenly.
+    const POSES: usize = 48;
+    const STEP: f64 = 0.618_033_988_749_894_9;
+    let pose = |pose: usize| {
+        let mut turns = model.bind_turns(glam::DVec3::ZERO);
+        for (joint, range) in model.ranges.iter().enumerate() {
+            let Some(range) = range else { continue };
+            let component = |axis: usize| {
+                let share = ((1 + pose) as f64 * STEP * (1 + 3 * joint + axis) as f64).fract();
+                ((2.0 * share - 1.0) * range.sigma[axis]).clamp(range.low[axis], range.high[axis])
+            };
+            let turn = glam::DVec3::new(component(0), component(1), component(2));
+            turns.turns[joint] = flyrig_solve::exp_rotation(range.axes * turn);
+        }
+        model.marks(&turns)
+    };
+    let marks: Vec<_> = (0..POSES).map(pose).collect();
+    move |a, b| {
+        let mut lengths: Vec<f64> = marks.iter().map(|marks| (marks[a] - marks[b]).length()).collect();
+        median(&mut lengths).unwrap_or(f64::NAN)
+    }
+}
+
 /// Returns a template of a height in metres, unscaled where none is known.
 pub(crate) fn template_of_height(
     template: &Template,
@@ -237,7 +263,8 @@ mod tests {
             .into_iter()
             .map(|(name, factor)| (name.to_owned(), factor))
             .collect();
-        let person = BodyModel::new(&scale_template(&template, &model, &truth).unwrap()).unwrap();
+        let stretched = scale_template(&template, &model, &truth).unwrap();
+        let person = BodyModel::new(&stretched).unwrap();
         let rig = ring(3);
         let keypoints: Vec<Vec<_>> = (0..8)
             .map(|seed| {
@@ -247,7 +274,9 @@ mod tests {
             .collect();
         let (fitted, fit) = fit_template_shape(&template, &rig, &keypoints, &PoseConfig::default()).unwrap();
         assert_eq!(fit.sets, 8);
-        let fitted = BodyModel::new(&fitted).unwrap();
+        // Lengths of bones: the network's biases would count as parts of them.
+        let fitted = BodyModel::with_anatomical_marks(&fitted).unwrap();
+        let person = BodyModel::with_anatomical_marks(&stretched).unwrap();
         for (a, b) in [(23, 25), (25, 27), (11, 13), (13, 15), (11, 12), (23, 24)] {
             let length = |m: &BodyModel| (m.marks[a].point - m.marks[b].point).length();
             let (found, expected) = (length(&fitted), length(&person));
