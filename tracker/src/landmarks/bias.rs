@@ -51,9 +51,9 @@ const BY_PEAK: Table =
     &[(0.86, 0.7), (0.94, 0.85), (1.0, 1.0), (1.08, 1.3), (1.17, 1.7), (1.26, 2.2), (1.42, 3.3), (1.6, 4.5)];
 /// Confidence of a landmark with a peak, and the factor of its spread that the peak does not explain.
 const BY_CONFIDENCE: Table = &[(0.05, 1.8), (0.2, 1.7), (0.5, 1.2), (0.8, 1.15), (0.95, 1.0)];
-/// The same for a landmark without a peak.
+/// Confidence of a landmark without a peak, and its spread as a multiple of [`spread_m`].
 const WITHOUT_PEAK: Table = &[(0.05, 6.3), (0.2, 6.3), (0.5, 4.5), (0.85, 3.5)];
-/// The same for a network without heatmaps (seeds 401 to 412): it guesses hidden joints fairly well.
+/// Confidence of a landmark of a network without heatmaps, and its spread as a multiple of [`spread_m`] (seeds 401 to 412).
 const WITHOUT_HEATMAP: Table =
     &[(0.025, 7.4), (0.075, 4.6), (0.15, 4.4), (0.25, 3.6), (0.4, 2.5), (0.6, 1.6), (0.8, 1.2), (0.95, 1.0)];
 /// Ratio of a landmark's spreads along and across the wide direction of its peak, as a power of the peak's aspect, and the

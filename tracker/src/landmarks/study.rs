@@ -190,11 +190,11 @@ impl LandmarkStudy {
 /// Grouping of landmarks whose spreads are compared.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord)]
 pub enum SpreadBy {
-    /// By the width of the heatmap's peak, relative to the landmark's median.
+    /// Groups by the width of the heatmap's peak, relative to the landmark's median.
     Peak,
-    /// By confidence, of landmarks with a peak and relative to what the peak explains.
+    /// Groups landmarks with a peak by confidence; spreads are relative to the spread that the peak predicts.
     Confidence,
-    /// By confidence, of landmarks without a peak.
+    /// Groups landmarks without a peak by confidence.
     ConfidenceAlone,
 }
 

@@ -2,7 +2,8 @@
 //!
 //! BlazePose regresses landmarks and outputs a heatmap for each. MediaPipe moves every landmark to the mean of the heatmap's
 //! weights around it (its calculator `RefineLandmarksFromHeatmap`, with the pose solution's window of 7 cells and least
-//! peak of 0.5), and so does [`Heatmaps::peak`]. The second moments of the same weights tell how sure the network is.
+//! peak of 0.5); [`Heatmaps::peak`] does the same. The second moments of the same weights give the width of the peak, which
+//! grows with the error of the landmark.
 
 use glam::DVec2;
 
