@@ -249,7 +249,10 @@ pub(crate) fn seen_landmarks(views: &[Option<ViewKeypoints>], threshold: f64) ->
 
 #[cfg(test)]
 mod tests {
+    use flyrig_solve::exp_rotation;
     use glam::{DMat4, DVec3};
+    use rand::rngs::StdRng;
+    use rand::{RngExt as _, SeedableRng as _};
 
     use super::*;
     use crate::error::TrackErrorKind;
@@ -281,6 +284,38 @@ mod tests {
             let length = |m: &BodyModel| (m.marks[a].point - m.marks[b].point).length();
             let (found, expected) = (length(&fitted), length(&person));
             assert!((found / expected - 1.0).abs() < 0.02, "{a}-{b}: {found} {expected}");
+        }
+    }
+
+    #[test]
+    fn usual_lengths_are_those_of_bones_and_of_marks_beside_them() {
+        let template = body();
+        // Joints at both ends of one bone: the pose does not matter.
+        let bones = BodyModel::with_anatomical_marks(&template).unwrap();
+        let rest = usual_lengths(&bones);
+        for (a, b) in [(13, 15), (23, 25), (25, 27)] {
+            let bone = (bones.marks[a].point - bones.marks[b].point).length();
+            assert!((rest(a, b) / bone - 1.0).abs() < 1e-9, "{a}-{b}: {} {bone}", rest(a, b));
+        }
+        // Landmarks beside the joints: the median of many random poses within a standard deviation.
+        let model = BodyModel::new(&template).unwrap();
+        let rest = usual_lengths(&model);
+        let mut random = StdRng::seed_from_u64(1);
+        let marks: Vec<_> = (0..1000)
+            .map(|_| {
+                let mut turns = model.bind_turns(DVec3::ZERO);
+                for (turn, range) in turns.turns.iter_mut().zip(&model.ranges) {
+                    let Some(range) = range else { continue };
+                    let v = DVec3::from_array(std::array::from_fn(|_| random.random_range(-1.0..1.0))) * range.sigma;
+                    *turn = exp_rotation(range.axes * v.clamp(range.low, range.high));
+                }
+                model.marks(&turns)
+            })
+            .collect();
+        for (a, b) in [(11, 13), (12, 14), (11, 12), (11, 23), (23, 25)] {
+            let mut lengths: Vec<f64> = marks.iter().map(|marks| (marks[a] - marks[b]).length()).collect();
+            let usual = median(&mut lengths).unwrap();
+            assert!((rest(a, b) / usual - 1.0).abs() < 0.02, "{a}-{b}: {} {usual}", rest(a, b));
         }
     }
 
