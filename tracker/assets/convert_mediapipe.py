@@ -7,6 +7,9 @@
     venv/bin/python -m zipfile -e mediapipe-0.10.21-*.whl wheel
     modules=wheel/mediapipe/modules
     venv/bin/python convert_mediapipe.py pose $modules/pose_landmark/pose_landmark_full.tflite pose_full.onnx
+    npm pack @mediapipe/pose@0.5.1675469404 && tar xzf mediapipe-pose-*.tgz
+    venv/bin/python convert_mediapipe.py pose package/pose_landmark_lite.tflite pose_lite.onnx
+    venv/bin/python convert_mediapipe.py pose package/pose_landmark_heavy.tflite pose_heavy.onnx
     venv/bin/python convert_mediapipe.py hand $modules/hand_landmark/hand_landmark_lite.tflite hand_lite.onnx
     venv/bin/python convert_mediapipe.py face $modules/face_landmark/face_landmark.tflite face.onnx
 

@@ -9,6 +9,7 @@
 //! Prints the processor time of each crop in milliseconds: median, least and most over 20 rounds. Without arguments it prints
 //! its usage.
 
+use std::path::Path;
 use std::time::Instant;
 
 use flyrig_tracker::PoseNet;
@@ -34,7 +35,8 @@ fn main() -> Result<()> {
     }
     // Within a pool of one thread the network's products stay on that thread.
     let pool = rayon::ThreadPoolBuilder::new().num_threads(1).build()?;
-    for (name, net) in [("all", PoseNet::embedded()?), ("no mask", PoseNet::embedded_without_mask()?)] {
+    for (name, with_mask) in [("all", true), ("no mask", false)] {
+        let net = PoseNet::load(Path::new(""), with_mask)?;
         let mut found = Vec::new();
         let mut times = Vec::new();
         for round in 0..ROUNDS {

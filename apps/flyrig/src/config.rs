@@ -11,6 +11,7 @@ use flyrig_fusion::{
 use flyrig_sim::SimConfig;
 use flyrig_sync::SyncSettings;
 use flyrig_takes::{SourceKind, SourceSection, TakeConfig};
+use flyrig_tracker::PoseNet;
 use flyrig_transport::TransportConfig;
 use flyrig_web::WebConfig;
 use serde::{Deserialize, Serialize};
@@ -194,7 +195,6 @@ impl Config {
         let paths = [
             &mut source.path,
             &mut source.calibration,
-            &mut perception.network,
             &mut perception.plates,
             &mut body.template,
             &mut body.person,
@@ -206,7 +206,10 @@ impl Config {
         for path in paths.into_iter().filter(|path| !path.as_os_str().is_empty()) {
             *path = folder.join(&path);
         }
-        // A name of networks that come with flyrig is no path.
+        // Names of networks that come with flyrig are no paths.
+        if !PoseNet::is_built_in(&perception.network) {
+            perception.network = folder.join(&perception.network);
+        }
         if let Some(weights) =
             self.appearance.weights.as_mut().filter(|path| !BUNDLED.iter().any(|name| path.as_os_str() == *name))
         {

@@ -68,10 +68,10 @@ fn person_checks(config: &Config) -> Vec<Result<()>> {
     vec![
         known_body(&config.body, config.output.avatar).map(|_| ()),
         config.body.person_file().map_or(Ok(()), check_person),
-        if network.as_os_str().is_empty() {
+        if PoseNet::is_built_in(network) {
             Ok(())
         } else {
-            PoseNet::from_description(network).map(|_| ()).context("perception.network")
+            PoseNet::load(network, true).map(|_| ()).context("perception.network")
         },
         weights(),
     ]

@@ -2,7 +2,7 @@
 
 use std::path::Path;
 
-use crate::error::TrackError;
+use crate::error::{TrackError, TrackErrorKind};
 use crate::image::crop::Crop;
 use crate::image::pixels::Rgb;
 use crate::landmarks::keypoints::{LANDMARK_COUNT, Sharpness};
@@ -21,10 +21,13 @@ const PX_PER_CELL: f64 = (NET_SIDE / HEATMAP_SIDE) as f64;
 /// Numbers of BlazePose's mask.
 const MASK_SIZE: usize = NET_SIDE * NET_SIDE;
 
-static EMBEDDED: &[u8] = include_bytes!("../../assets/pose_full.onnx");
+static FULL: &[u8] = include_bytes!("../../assets/pose_full.onnx");
+static LITE: &[u8] = include_bytes!("../../assets/pose_lite.onnx");
+/// Largest ONNX file, bytes.
+const MOST_BYTES: u64 = 1 << 30;
 
-/// Network that finds a person's landmarks: the one built in (BlazePose full; licence beside the file in `assets`), or one
-/// of the user's choice.
+/// Network that finds a person's landmarks: one of those built in (BlazePose full and lite; licence beside the files in
+/// `assets`), another BlazePose, or one of the user's choice.
 #[derive(Clone)]
 pub struct PoseNet {
     kind: Kind,
@@ -43,12 +46,48 @@ impl std::fmt::Debug for PoseNet {
 }
 
 impl PoseNet {
-    /// Loads the network built into this crate. Takes a few hundred milliseconds; clone it instead of loading it twice.
+    /// Loads BlazePose full, which is built into this crate. Takes a few hundred milliseconds; clone it instead of loading it
+    /// twice.
     ///
     /// # Errors
     /// Kind [`crate::TrackErrorKind::Net`] when the file does not load.
     pub fn embedded() -> Result<Self, TrackError> {
-        Self::from_onnx(EMBEDDED)
+        Self::from_onnx(FULL)
+    }
+
+    /// Loads the network that a setting names: "full" (or nothing) and "lite" are built in, an ONNX file holds another
+    /// BlazePose (`assets/convert_mediapipe.py`), and any other file describes a network of the user's choice
+    /// (docs/guide/people.md). Leaves out BlazePose's mask, a quarter of the work, unless `with_mask`.
+    ///
+    /// # Errors
+    /// Kind [`crate::TrackErrorKind::Net`] names the file, and the key where one is wrong.
+    pub fn load(network: &Path, with_mask: bool) -> Result<Self, TrackError> {
+        let blazepose = |bytes: &[u8]| {
+            let loaded = LoadedNet::of_crops(bytes, NET_SIDE, "pose")?;
+            Self::checked(if with_mask { loaded } else { loaded.without_output(MASK_SIZE)? }, with_mask)
+        };
+        match network.to_str() {
+            Some("" | "full") => return blazepose(FULL),
+            Some("lite") => return blazepose(LITE),
+            _ => {}
+        }
+        let failed = |what: String| TrackError::new(TrackErrorKind::Net, format!("{}: {what}", network.display()));
+        let hint = "\"full\" and \"lite\" are built in, an .onnx file holds another BlazePose, a .toml file describes any other network";
+        let length = std::fs::metadata(network).map_err(|error| failed(format!("{error}; {hint}")))?.len();
+        if network.extension().is_none_or(|extension| extension != "onnx") {
+            return Ok(Self { kind: Kind::Chosen(Box::new(ChosenNet::read(network)?)) });
+        }
+        if length > MOST_BYTES {
+            return Err(failed(format!("{length} bytes are too many for a landmark network; at most {MOST_BYTES}")));
+        }
+        let bytes = std::fs::read(network).map_err(|error| failed(error.to_string()))?;
+        blazepose(&bytes).map_err(|error| failed(error.message))
+    }
+
+    /// Whether a setting names a built-in network.
+    #[must_use]
+    pub fn is_built_in(network: &Path) -> bool {
+        matches!(network.to_str(), Some("" | "full" | "lite"))
     }
 
     /// Loads a network from the bytes of an ONNX file with BlazePose's outputs, which are identified by their sizes.
@@ -59,27 +98,10 @@ impl PoseNet {
         Self::checked(LoadedNet::of_crops(bytes, NET_SIDE, "pose")?, true)
     }
 
-    /// Loads the network built into this crate without its mask, whose branch is a quarter of the work.
-    ///
-    /// # Errors
-    /// Those of [`Self::embedded`].
-    pub fn embedded_without_mask() -> Result<Self, TrackError> {
-        let loaded = LoadedNet::of_crops(EMBEDDED, NET_SIDE, "pose")?;
-        Self::checked(loaded.without_output(MASK_SIZE)?, false)
-    }
-
     fn checked(loaded: LoadedNet, has_mask: bool) -> Result<Self, TrackError> {
         let net = loaded.runnable()?;
         run_blazepose(&net, &net.blank(), has_mask)?;
         Ok(Self { kind: Kind::BlazePose { net, has_mask } })
-    }
-
-    /// Loads a network of the user's choice from a TOML file that describes it (docs/guide/people.md).
-    ///
-    /// # Errors
-    /// Kind [`crate::TrackErrorKind::Net`] names the file, and the key where one is wrong.
-    pub fn from_description(path: &Path) -> Result<Self, TrackError> {
-        Ok(Self { kind: Kind::Chosen(Box::new(ChosenNet::read(path)?)) })
     }
 
     /// Whether outputs hold the depth of landmarks.
@@ -160,7 +182,7 @@ mod tests {
     fn the_embedded_network_sees_nobody_in_grey_and_refuses_a_wrong_size() {
         let net = PoseNet::embedded().unwrap();
         let output = net.infer(&grey(), whole()).unwrap();
-        let without = PoseNet::embedded_without_mask().unwrap().infer(&grey(), whole()).unwrap();
+        let without = PoseNet::load(Path::new(""), false).unwrap().infer(&grey(), whole()).unwrap();
         assert!(
             without.mask.is_none() && without.landmarks == output.landmarks,
             "the mask's branch changes nothing else"
@@ -190,8 +212,28 @@ mod tests {
     }
 
     #[test]
+    fn networks_are_loaded_by_name_and_by_file() {
+        let output = |network: &Path| PoseNet::load(network, true).unwrap().infer(&grey(), whole()).unwrap();
+        let full = output(Path::new(""));
+        assert_eq!(output(Path::new("full")).landmarks, full.landmarks);
+        let lite = output(Path::new("lite"));
+        assert!(lite.landmarks != full.landmarks && lite.presence < 0.5, "presence {}", lite.presence);
+        let file = Path::new(concat!(env!("CARGO_MANIFEST_DIR"), "/assets/pose_lite.onnx"));
+        assert_eq!(output(file).landmarks, lite.landmarks);
+
+        let refused = |path: &Path| PoseNet::load(path, true).unwrap_err().to_string();
+        let unknown = refused(Path::new("light"));
+        assert!(unknown.contains("light") && unknown.contains("\"full\" and \"lite\" are built in"), "{unknown}");
+        let folder = tempfile::tempdir().unwrap();
+        let other = folder.path().join("face.onnx");
+        std::fs::write(&other, b"not an ONNX file").unwrap();
+        let damaged = refused(&other);
+        assert!(damaged.contains("face.onnx") && damaged.contains("convert_mediapipe.py"), "{damaged}");
+    }
+
+    #[test]
     fn a_damaged_file_is_an_error() {
         assert_eq!(PoseNet::from_onnx(b"not an ONNX file").unwrap_err().kind, TrackErrorKind::Net);
-        assert_eq!(PoseNet::from_onnx(&EMBEDDED[..EMBEDDED.len() / 2]).unwrap_err().kind, TrackErrorKind::Net);
+        assert_eq!(PoseNet::from_onnx(&FULL[..FULL.len() / 2]).unwrap_err().kind, TrackErrorKind::Net);
     }
 }

@@ -17,7 +17,8 @@ pub struct PoseConfig {
     pub confidence_threshold: f64,
     /// Largest residual at which a view agrees on a landmark, metres at its depth.
     pub inlier_m: f64,
-    /// Standard deviation of the landmarks, as a multiple of that measured on simulated people.
+    /// Standard deviation of the landmarks, as a multiple of that measured on simulated people: errors of a landmark are alike
+    /// in all views and last for many frames, so that they are no independent measurements.
     pub landmark_spread: f64,
     /// Standard deviation of the body's outline from the mask's (clothes, the body's shape), metres.
     pub outline_sigma_m: f64,
@@ -50,7 +51,7 @@ impl Default for PoseConfig {
             presence_threshold: 0.5,
             confidence_threshold: 0.3,
             inlier_m: 0.07,
-            landmark_spread: 1.0,
+            landmark_spread: 1.4,
             outline_sigma_m: 0.01,
             outline_rounds: 2,
             shape_rounds: 2,

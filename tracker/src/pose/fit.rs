@@ -38,7 +38,7 @@ const LANDMARK_WEIGHT: [f64; LANDMARK_COUNT] = {
 const LIMIT_SIGMA: f64 = 0.05;
 /// Number of independent measurements that the line points of a view are worth: more points share their weight, since the
 /// errors of neighbours are correlated.
-const OUTLINE_COUNT: f64 = 640.0;
+const OUTLINE_COUNT: f64 = 320.0;
 const TEXTURE_COUNT: f64 = 20.0;
 /// Distance at which a line point loses three quarters of its weight, standard deviations: it belongs to another edge.
 const LINE_ROBUST: f64 = 3.0;

@@ -44,8 +44,8 @@ pub struct PerceptionSettings {
     /// Largest number of tracked people, 1 to 4; with 1 the person on whom most views agree.
     #[arg(long, default_value_t = 1)]
     pub people: usize,
-    /// Description of a landmark network to use in place of the one built in: a TOML file, see docs/guide/people.md. It needs
-    /// two cameras or more.
+    /// Landmark network: "full" or "lite" (built in; half the work and less accurate), an ONNX file with another BlazePose, or a
+    /// TOML file that describes any other network, which needs two cameras or more (docs/guide/people.md). Empty: "full".
     #[arg(long, value_name = "FILE", default_value = "", hide_default_value = true,
         value_parser = OsStringValueParser::new().map(PathBuf::from))]
     pub network: PathBuf,

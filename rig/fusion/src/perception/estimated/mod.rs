@@ -287,11 +287,7 @@ impl Perception for EstimatedPerception {
 
 /// Loads the landmark network of the settings.
 fn network(settings: &PerceptionSettings, rig: &Rig) -> Result<PoseNet, FusionError> {
-    if settings.network.as_os_str().is_empty() {
-        let is_masked = settings.masks == Origin::Estimated;
-        return Ok(if is_masked { PoseNet::embedded() } else { PoseNet::embedded_without_mask() }?);
-    }
-    let network = PoseNet::from_description(&settings.network)?;
+    let network = PoseNet::load(&settings.network, settings.masks == Origin::Estimated)?;
     if rig.cameras.len() < 2 && !network.sees_depth() {
         return Err(FusionError::Setting(format!(
             "perception.network: {} gives no depth, and a single camera needs it; leave the setting out, or add a camera",
