@@ -442,7 +442,7 @@ mod tests {
         let folder = tempfile::tempdir().unwrap();
         let rig = folder.path().join("rig.toml");
         let text = "[body]\navatar = \"anna.flyavatar\"\n[transport]\nkeys = \"keys\"\n[web]\nkey = \"/etc/key.pem\"\n\
-                    [appearance]\nweights = \"tiny\"\n[sim.motion]\nbvh = \"walk.bvh\"\n";
+                    [appearance]\nweights = \"tiny\"\n[perception]\nnetwork = \"lite\"\n[sim.motion]\nbvh = \"walk.bvh\"\n";
         std::fs::write(&rig, text).unwrap();
         let config = Config::load(&rig).unwrap();
         let at = |name: &str| folder.path().join(name);
@@ -452,9 +452,12 @@ mod tests {
             (Some(at("walk.bvh")), Path::new("/etc/key.pem"))
         );
         assert_eq!(config.appearance.weights.as_deref(), Some(Path::new("tiny")));
+        assert_eq!(config.perception.network, Path::new("lite"));
         assert!(config.source.path.as_os_str().is_empty() && config.perception.plates.as_os_str().is_empty());
-        std::fs::write(&rig, text.replace("tiny", "mine.safetensors")).unwrap();
-        assert_eq!(Config::load(&rig).unwrap().appearance.weights, Some(at("mine.safetensors")));
+        std::fs::write(&rig, text.replace("tiny", "mine.safetensors").replace("lite", "light.toml")).unwrap();
+        let config = Config::load(&rig).unwrap();
+        assert_eq!(config.appearance.weights, Some(at("mine.safetensors")));
+        assert_eq!(config.perception.network, at("light.toml"));
     }
 
     #[test]

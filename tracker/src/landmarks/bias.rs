@@ -46,7 +46,8 @@ const MEASURED: [Measured; 17] = [
 ];
 
 /// Spread of a heatmap's peak as a multiple of the landmark's median, and the spread of the landmark as a multiple of
-/// [`spread_m`], between those that the same command prints for these people and for two recorded bodies.
+/// [`spread_m`], between those that the same command prints for these people and for two recorded bodies. Those of these people
+/// alone are narrower and give joints that are 0.4 mm worse, on these people too (docs/benchmarks/perception.md).
 const BY_PEAK: Table =
     &[(0.86, 0.7), (0.94, 0.85), (1.0, 1.0), (1.08, 1.3), (1.17, 1.7), (1.26, 2.2), (1.42, 3.3), (1.6, 4.5)];
 /// Confidence of a landmark with a peak, and the factor of its spread that the peak does not explain.

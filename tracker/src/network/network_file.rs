@@ -106,25 +106,33 @@ fn one() -> f64 {
     1.0
 }
 
+/// Returns an error that names a file.
+fn failed(file: &Path, what: impl std::fmt::Display) -> TrackError {
+    TrackError::new(TrackErrorKind::Net, format!("{}: {what}", file.display()))
+}
+
+/// Reads an ONNX file of a plausible size.
+///
+/// # Errors
+/// Kind [`TrackErrorKind::Net`] names the file.
+pub(crate) fn read_onnx(path: &Path) -> Result<Vec<u8>, TrackError> {
+    let length = std::fs::metadata(path).map_err(|error| failed(path, error))?.len();
+    if length > MOST_BYTES {
+        return Err(failed(path, format!("{length} bytes are too many for a landmark network; at most {MOST_BYTES}")));
+    }
+    std::fs::read(path).map_err(|error| failed(path, error))
+}
+
 impl NetworkFile {
     /// Reads a description and the ONNX file that it names.
     ///
     /// # Errors
     /// Kind [`TrackErrorKind::Net`] names the file, and the key where one is wrong.
     pub fn read(path: &Path) -> Result<(Self, Vec<u8>), TrackError> {
-        let failed =
-            |file: &Path, what: String| TrackError::new(TrackErrorKind::Net, format!("{}: {what}", file.display()));
-        let text = std::fs::read_to_string(path).map_err(|error| failed(path, error.to_string()))?;
+        let text = std::fs::read_to_string(path).map_err(|error| failed(path, error))?;
         let described = Self::parse(&text).map_err(|what| failed(path, what))?;
         let onnx = path.parent().unwrap_or(Path::new("")).join(&described.file);
-        let length = std::fs::metadata(&onnx).map_err(|error| failed(&onnx, error.to_string()))?.len();
-        if length > MOST_BYTES {
-            return Err(failed(
-                &onnx,
-                format!("{length} bytes are too many for a landmark network; at most {MOST_BYTES}"),
-            ));
-        }
-        let bytes = std::fs::read(&onnx).map_err(|error| failed(&onnx, error.to_string()))?;
+        let bytes = read_onnx(&onnx)?;
         Ok((described, bytes))
     }
 

@@ -9,6 +9,7 @@ use crate::landmarks::keypoints::{LANDMARK_COUNT, Sharpness};
 use crate::network::chosen_net::ChosenNet;
 use crate::network::heatmap::{HEATMAP_SIDE, Heatmaps};
 use crate::network::landmark_net::{LandmarkNet, LoadedNet, sigmoid};
+use crate::network::network_file::read_onnx;
 use crate::network::output::{CropLandmark, NET_SIDE, NetOutput};
 
 /// Floats per landmark in BlazePose's output.
@@ -23,8 +24,6 @@ const MASK_SIZE: usize = NET_SIDE * NET_SIDE;
 
 static FULL: &[u8] = include_bytes!("../../assets/pose_full.onnx");
 static LITE: &[u8] = include_bytes!("../../assets/pose_lite.onnx");
-/// Largest ONNX file, bytes.
-const MOST_BYTES: u64 = 1 << 30;
 
 /// Network that finds a person's landmarks: one of those built in (BlazePose full and lite; licence beside the files in
 /// `assets`), another BlazePose, or one of the user's choice.
@@ -73,15 +72,11 @@ impl PoseNet {
         }
         let failed = |what: String| TrackError::new(TrackErrorKind::Net, format!("{}: {what}", network.display()));
         let hint = "\"full\" and \"lite\" are built in, an .onnx file holds another BlazePose, a .toml file describes any other network";
-        let length = std::fs::metadata(network).map_err(|error| failed(format!("{error}; {hint}")))?.len();
+        std::fs::metadata(network).map_err(|error| failed(format!("{error}; {hint}")))?;
         if network.extension().is_none_or(|extension| extension != "onnx") {
             return Ok(Self { kind: Kind::Chosen(Box::new(ChosenNet::read(network)?)) });
         }
-        if length > MOST_BYTES {
-            return Err(failed(format!("{length} bytes are too many for a landmark network; at most {MOST_BYTES}")));
-        }
-        let bytes = std::fs::read(network).map_err(|error| failed(error.to_string()))?;
-        blazepose(&bytes).map_err(|error| failed(error.message))
+        blazepose(&read_onnx(network)?).map_err(|error| failed(error.message))
     }
 
     /// Whether a setting names a built-in network.

@@ -22,13 +22,16 @@ pub struct BenchLandmarksArgs {
     /// Interval of the used frames.
     #[arg(long, default_value_t = 1, value_parser = clap::value_parser!(u64).range(1..))]
     pub every: u64,
+    /// Landmark network, as `--network` of `flyrig run` names it.
+    #[arg(long, value_name = "NETWORK", default_value = "full")]
+    pub network: PathBuf,
     #[command(flatten)]
     pub rate: FpsArgs,
 }
 
 /// Runs the command.
 pub fn landmarks(args: &BenchLandmarksArgs) -> Result<()> {
-    let mut study = LandmarkStudy::new(PoseNet::embedded()?);
+    let mut study = LandmarkStudy::new(PoseNet::load(&args.network, false)?);
     for folder in &args.datasets {
         let name = folder.file_name().map_or_else(String::new, |name| name.to_string_lossy().into_owned());
         let human = load_gltf(&dataset::gltf_file(folder)?)?;

@@ -68,8 +68,8 @@ pub struct BenchPerceptionArgs {
     /// Interval of the frame sets whose masks are written as images: red where the mask is too small, blue where it is too large.
     #[arg(long, value_name = "SETS", value_parser = clap::value_parser!(u64).range(1..))]
     pub mask_pictures: Option<u64>,
-    /// Description of a landmark network that replaces the built-in one.
-    #[arg(long, value_name = "FILE")]
+    /// Landmark network, as `--network` of `flyrig run` names it.
+    #[arg(long, value_name = "NETWORK")]
     pub network: Option<PathBuf>,
     #[command(flatten)]
     pub replay: RecordedArgs,
