@@ -6,7 +6,7 @@
 //! ```
 //!
 //! `CROPS.f32` holds crops of 256 x 256 x 3 numbers, RGB in 0..=1; `LANDMARKS.f32` receives 33 x 3 numbers a crop, metres.
-//! Prints the processor time of each crop in milliseconds: median, least and most over 20 rounds. Without arguments it prints
+//! Prints the elapsed time of each crop in milliseconds: median, least and most over 20 rounds. Without arguments it prints
 //! its usage.
 
 use std::path::Path;

@@ -51,24 +51,18 @@ impl PoseNet {
     /// # Errors
     /// Kind [`crate::TrackErrorKind::Net`] when the file does not load.
     pub fn embedded() -> Result<Self, TrackError> {
-        Self::from_onnx(FULL)
+        Self::blazepose(FULL, true)
     }
 
     /// Loads the network that a setting names: "full" (or nothing) and "lite" are built in, an ONNX file holds another
     /// BlazePose (`assets/convert_mediapipe.py`), and any other file describes a network of the user's choice
-    /// (docs/guide/people.md). Leaves out BlazePose's mask, a quarter of the work, unless `with_mask`.
+    /// (docs/guide/people.md). Leaves out BlazePose's mask, a fifth of the work, unless `with_mask`.
     ///
     /// # Errors
     /// Kind [`crate::TrackErrorKind::Net`] names the file, and the key where one is wrong.
     pub fn load(network: &Path, with_mask: bool) -> Result<Self, TrackError> {
-        let blazepose = |bytes: &[u8]| {
-            let loaded = LoadedNet::of_crops(bytes, NET_SIDE, "pose")?;
-            Self::checked(if with_mask { loaded } else { loaded.without_output(MASK_SIZE)? }, with_mask)
-        };
-        match network.to_str() {
-            Some("" | "full") => return blazepose(FULL),
-            Some("lite") => return blazepose(LITE),
-            _ => {}
+        if let Some(bytes) = built_in(network) {
+            return Self::blazepose(bytes, with_mask);
         }
         let failed = |what: String| TrackError::new(TrackErrorKind::Net, format!("{}: {what}", network.display()));
         let hint = "\"full\" and \"lite\" are built in, an .onnx file holds another BlazePose, a .toml file describes any other network";
@@ -76,25 +70,20 @@ impl PoseNet {
         if network.extension().is_none_or(|extension| extension != "onnx") {
             return Ok(Self { kind: Kind::Chosen(Box::new(ChosenNet::read(network)?)) });
         }
-        blazepose(&read_onnx(network)?).map_err(|error| failed(error.message))
+        Self::blazepose(&read_onnx(network)?, with_mask).map_err(|error| failed(error.message))
     }
 
     /// Whether a setting names a built-in network.
     #[must_use]
     pub fn is_built_in(network: &Path) -> bool {
-        matches!(network.to_str(), Some("" | "full" | "lite"))
+        built_in(network).is_some()
     }
 
-    /// Loads a network from the bytes of an ONNX file with BlazePose's outputs, which are identified by their sizes.
-    ///
-    /// # Errors
-    /// Kind [`crate::TrackErrorKind::Net`] when the file does not load or has other inputs or outputs.
-    pub fn from_onnx(bytes: &[u8]) -> Result<Self, TrackError> {
-        Self::checked(LoadedNet::of_crops(bytes, NET_SIDE, "pose")?, true)
-    }
-
-    fn checked(loaded: LoadedNet, has_mask: bool) -> Result<Self, TrackError> {
-        let net = loaded.runnable()?;
+    /// Loads a network from the bytes of an ONNX file with BlazePose's outputs, which are identified by their sizes, and runs it
+    /// once.
+    fn blazepose(bytes: &[u8], has_mask: bool) -> Result<Self, TrackError> {
+        let loaded = LoadedNet::of_crops(bytes, NET_SIDE, "pose")?;
+        let net = if has_mask { loaded } else { loaded.without_output(MASK_SIZE)? }.runnable()?;
         run_blazepose(&net, &net.blank(), has_mask)?;
         Ok(Self { kind: Kind::BlazePose { net, has_mask } })
     }
@@ -129,6 +118,15 @@ impl PoseNet {
             Kind::BlazePose { net, has_mask } => run_blazepose(net, &crop.sample(picture), *has_mask),
             Kind::Chosen(net) => net.infer(picture, crop),
         }
+    }
+}
+
+/// Returns the ONNX file of a built-in network by its name.
+fn built_in(network: &Path) -> Option<&'static [u8]> {
+    match network.to_str()? {
+        "" | "full" => Some(FULL),
+        "lite" => Some(LITE),
+        _ => None,
     }
 }
 
@@ -228,7 +226,7 @@ mod tests {
 
     #[test]
     fn a_damaged_file_is_an_error() {
-        assert_eq!(PoseNet::from_onnx(b"not an ONNX file").unwrap_err().kind, TrackErrorKind::Net);
-        assert_eq!(PoseNet::from_onnx(&FULL[..FULL.len() / 2]).unwrap_err().kind, TrackErrorKind::Net);
+        assert_eq!(PoseNet::blazepose(b"not an ONNX file", true).unwrap_err().kind, TrackErrorKind::Net);
+        assert_eq!(PoseNet::blazepose(&FULL[..FULL.len() / 2], true).unwrap_err().kind, TrackErrorKind::Net);
     }
 }

@@ -219,6 +219,22 @@ mod tests {
         cameras.iter().enumerate().flat_map(one).collect()
     }
 
+    /// Returns the measurements of a person in several poses, matched with a body in estimates of these poses.
+    fn sets<'a>(
+        cameras: &[Camera],
+        (truth, true_turns): (&Template, &[JointTurns]),
+        (template, model, turns): (&Template, &'a BodyModel, &[JointTurns]),
+        seen: &'a [Vec<FitView>],
+    ) -> Vec<ShapeSet<'a>> {
+        let poses = true_turns.iter().zip(turns).zip(seen);
+        poses
+            .map(|((true_turns, turns), views)| ShapeSet {
+                problem: fit_problem(model, views, 1.0),
+                outline: outline(cameras, (truth, true_turns), (template, model, turns)),
+            })
+            .collect()
+    }
+
     /// A person of another shape, and the space that the shape lies in.
     fn person() -> (ShapeSpace, Vec<f64>, Template) {
         let space = ShapeSpace::new(&body());
@@ -258,15 +274,7 @@ mod tests {
             let model = BodyModel::new(&template).unwrap();
             let seen: Vec<Vec<FitView>> =
                 true_turns.iter().map(|turns| views(&rig.cameras, &true_model, turns)).collect();
-            let sets: Vec<ShapeSet<'_>> = seen
-                .iter()
-                .zip(&true_turns)
-                .zip(&at.poses)
-                .map(|((views, true_turns), turns)| ShapeSet {
-                    problem: fit_problem(&model, views, 1.0),
-                    outline: outline(&rig.cameras, (&truth, true_turns), (&template, &model, turns)),
-                })
-                .collect();
+            let sets = sets(&rig.cameras, (&truth, &true_turns), (&template, &model, &at.poses), &seen);
             (at, sigma) = ShapeProblem { space: &space, sets: &sets }.solve(&at).unwrap();
             template = space.template(&at.shape).unwrap();
         }
@@ -294,14 +302,7 @@ mod tests {
         let template = space.template(&shape).unwrap();
         let model = BodyModel::new(&template).unwrap();
         let seen: Vec<Vec<FitView>> = true_turns.iter().map(|turns| views(&rig.cameras, &true_model, turns)).collect();
-        let sets: Vec<ShapeSet<'_>> = seen
-            .iter()
-            .zip(&true_turns)
-            .map(|(views, turns)| ShapeSet {
-                problem: fit_problem(&model, views, 1.0),
-                outline: outline(&rig.cameras, (&truth, turns), (&template, &model, turns)),
-            })
-            .collect();
+        let sets = sets(&rig.cameras, (&truth, &true_turns), (&template, &model, &true_turns), &seen);
         let problem = ShapeProblem { space: &space, sets: &sets };
         let from = |shape: Vec<f64>| ShapeAndPoses { shape, poses: true_turns.clone() };
         let options = Convergence { max_steps: 200, min_gain: 1e-9, ..Convergence::default() };
