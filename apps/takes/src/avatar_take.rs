@@ -1,7 +1,8 @@
 //! Tracking of a take's person, with the images that an avatar is fitted to.
 
 use anyhow::{Context as _, Result, bail};
-use flyrig_avatar::{Avatar, KnownPoses, TrainingFrame, TrainingView};
+use flyrig_avatar::{Avatar, KnownPoses, TrainingFrame};
+use flyrig_fit::TrainingView;
 use flyrig_fusion::{BodySettings, Outcome, PersonId, person_surface};
 use flyrig_renderer::HarmonicOrder;
 use flyrig_report::{progress_bar, stop};

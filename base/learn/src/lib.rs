@@ -3,8 +3,10 @@
 //! A crate of its own because of the build time of `burn`, which other crates use through this one.
 
 mod adam;
+mod column_adam;
 mod parameters;
 
 pub use adam::{AdamStep, Moments};
 pub use burn_tensor;
+pub use column_adam::ColumnAdam;
 pub use parameters::{Parameter, Start, Tensors, count, drawn, is_finite, to_vec};

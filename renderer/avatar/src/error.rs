@@ -4,7 +4,6 @@ use std::path::PathBuf;
 
 use flyrig_body::BodyError;
 use flyrig_gpu::GpuError;
-use flyrig_renderer::BackwardError;
 
 /// Reason why an avatar cannot be built, read or drawn.
 #[derive(Debug, thiserror::Error)]
@@ -12,9 +11,6 @@ pub enum AvatarError {
     /// The graphics adapter reported an error.
     #[error(transparent)]
     Gpu(#[from] GpuError),
-    /// Derivatives could not be recorded.
-    #[error(transparent)]
-    Backward(#[from] BackwardError),
     /// The body is invalid.
     #[error(transparent)]
     Body(#[from] BodyError),
@@ -37,7 +33,7 @@ pub enum AvatarError {
     /// A texture does not fit the avatar.
     #[error("{0}")]
     Texture(String),
-    /// The images cannot be learned from.
+    /// Networks cannot predict this avatar.
     #[error("{0}")]
-    Images(String),
+    Networks(String),
 }

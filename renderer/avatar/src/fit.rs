@@ -1,12 +1,6 @@
-//! Fit of an avatar to the images of a take by gradient descent.
+//! Avatar as a model that is fitted to the images of its take.
 
-mod adam;
-pub(crate) mod checkpoint;
-pub(crate) mod descent;
-pub(crate) mod image_error;
-mod outline;
+pub(crate) mod avatar_model;
 mod pose_fit;
 mod skin_fit;
 mod skinning;
-mod ssim;
-pub(crate) mod training_view;

@@ -2,13 +2,12 @@
 //!
 //! An [`Avatar`] is a body with skin weights, and for each Gaussian an offset, scales, a rotation, an opacity and a
 //! colour in canonical space ([`GaussianParameters`]). [`Avatar::pose`] transforms them to the world by linear blend
-//! skinning, with or without a deformation graph's translations; [`Fit`] optimises them by gradient descent on images,
-//! directly or as outputs of local networks ([`Fit::use_networks`]).
+//! skinning, with or without a deformation graph's translations. [`AvatarModel`] is what [`flyrig_fit::Fit`] optimises by
+//! gradient descent on images, directly or as outputs of local networks ([`AvatarModel::use_networks`]).
 //!
 //! - `model`: attributes, posing, the room's light, files, rendering with fewer Gaussians in small images, and the surface and colours as the
 //!   start of live tracking.
-//! - `fit`: gradient descent with corrections of poses and skin weights, on crops without the mixed colours of the outline; its state
-//!   between steps.
+//! - `fit`: the avatar as a model of a fit, with corrections of poses and skin weights.
 //! - `local`: LoGAvatar's local networks. `edit`: texture and shape.
 
 mod edit;
@@ -20,10 +19,7 @@ mod model;
 pub use edit::atlas::{Atlas, DEFAULT_ATLAS_SIDE};
 pub use edit::paint::Painted;
 pub use error::AvatarError;
-pub use fit::checkpoint::FitProgress;
-pub use fit::descent::{Fit, FitSettings, StepReport, TrainingFrame};
-pub use fit::image_error::{ErrorWeights, ImageDifference, Photograph};
-pub use fit::training_view::TrainingView;
+pub use fit::avatar_model::{AvatarFitSettings, AvatarModel, TrainingFrame};
 pub use local::atlas_map::AtlasLayout;
 pub use local::networks::LocalSettings;
 pub use model::avatar::{Attachment, Avatar, Card, Hanging};

@@ -6,7 +6,6 @@ pub(crate) mod detail;
 mod file;
 pub(crate) mod known_poses;
 pub(crate) mod light;
-pub(crate) mod neighbors;
 pub(crate) mod parameters;
 pub(crate) mod posing;
 pub(crate) mod scene;

@@ -3,9 +3,10 @@
 #![allow(clippy::unwrap_used)]
 
 use flyrig_avatar::{
-    AtlasLayout, Avatar, AvatarError, AvatarScene, Bones, Fit, FitSettings, LocalSettings, TrainingFrame, TrainingView,
+    AtlasLayout, Avatar, AvatarFitSettings, AvatarModel, AvatarScene, Bones, LocalSettings, TrainingFrame,
 };
 use flyrig_body::{DEFAULT_SIGMA2_M2, ShapeParams, build_graph, default_template, sample_surface};
+use flyrig_fit::{Fit, FitSettings, TrainingView};
 use flyrig_gpu::{GpuContext, testing::on_both};
 use flyrig_renderer::HarmonicOrder;
 use flyrig_types::{Camera, Intrinsics, Isometry, Lens, Pose};
@@ -60,22 +61,26 @@ fn take(gpu: &GpuContext, truth: &Avatar) -> (Vec<TrainingFrame>, Vec<TrainingVi
     (frames, views)
 }
 
+fn fit_of(gpu: &GpuContext, model: AvatarModel, views: &[TrainingView]) -> Fit<AvatarModel> {
+    Fit::new(gpu, model, views.to_vec(), FitSettings::default()).unwrap()
+}
+
 #[test]
 fn a_fit_explains_its_images_and_the_same_steps_give_the_same_bytes() {
     on_both(|gpu| {
         let truth = avatar(|i| [[0.5, 0.1, 0.1], [0.1, 0.4, 0.6], [0.6, 0.6, 0.2]][i / 40 % 3], 1500);
         let (frames, views) = take(gpu, &truth);
         let run = |steps: u32| {
-            let mut ours = avatar(|_| [0.2; 3], 1500);
-            let settings = FitSettings { color_rate: [5e-2, 1e-2], ..FitSettings::default() };
-            let mut fit = Fit::new(gpu, &ours, frames.clone(), views.clone(), settings).unwrap();
+            let settings = AvatarFitSettings { color_rate: [5e-2, 1e-2], ..AvatarFitSettings::default() };
+            let model = AvatarModel::new(avatar(|_| [0.2; 3], 1500), frames.clone(), settings);
+            let mut fit = fit_of(gpu, model, &views);
             assert_eq!(fit.images(), 6);
-            let before = fit.decibels(&ours).unwrap();
+            let before = fit.decibels().unwrap();
             for step in 0..steps {
-                let report = fit.step(&mut ours, step as f32 / steps as f32).unwrap();
+                let report = fit.step(step as f32 / steps as f32).unwrap();
                 assert!(report.loss.is_finite() && report.decibels.is_finite());
             }
-            (before, fit.decibels(&ours).unwrap(), ours)
+            (before, fit.decibels().unwrap(), fit.into_model().into_avatar())
         };
         let (before, after, _) = run(120);
         assert!(after > before + 4.0, "{before} {after}");
@@ -92,36 +97,37 @@ fn a_fit_that_was_killed_ends_as_one_that_was_not() {
     let geometry = LocalSettings { colors: false, ..networks.clone() };
     for networks in [None, Some(networks), Some(geometry)] {
         let begin = || {
-            let mut ours = avatar(|_| [0.2; 3], 1500);
-            let settings = FitSettings { refine_poses: true, skin_correction: true, ..FitSettings::default() };
-            let mut fit = Fit::new(&gpu, &ours, frames.clone(), views.clone(), settings).unwrap();
+            let settings =
+                AvatarFitSettings { refine_poses: true, skin_correction: true, ..AvatarFitSettings::default() };
+            let mut model = AvatarModel::new(avatar(|_| [0.2; 3], 1500), frames.clone(), settings);
             if let Some(networks) = &networks {
-                fit.use_networks(&mut ours, &[], networks).unwrap();
+                model.use_networks(&[], networks, 1).unwrap();
             }
-            (fit, ours)
+            fit_of(&gpu, model, &views)
         };
+        let bytes = |fit: &Fit<AvatarModel>| fit.model().avatar().to_bytes().unwrap();
         // Past several rounds of six images.
-        let run = |(fit, ours): &mut (Fit, Avatar), steps: std::ops::Range<u32>| {
+        let run = |fit: &mut Fit<AvatarModel>, steps: std::ops::Range<u32>| {
             for step in steps {
-                fit.step(ours, step as f32 / 120.0).unwrap();
+                fit.step(step as f32 / 120.0).unwrap();
             }
         };
         let mut whole = begin();
         run(&mut whole, 0..120);
         let mut killed = begin();
         run(&mut killed, 0..91);
-        let state = killed.0.checkpoint(&mut killed.1, "a take", 120).unwrap();
+        let state = killed.checkpoint("a take", 120).unwrap();
         drop(killed);
         let mut resumed = begin();
-        let progress = resumed.0.resume(&mut resumed.1, &state, "a take").unwrap();
+        let progress = resumed.resume(&state, "a take").unwrap();
         assert_eq!((progress.done, progress.total), (91, 120));
         run(&mut resumed, 91..120);
-        assert!(whole.1.to_bytes().unwrap() == resumed.1.to_bytes().unwrap(), "{networks:?}");
+        assert!(bytes(&whole) == bytes(&resumed), "{networks:?}");
 
         // A refused state changes nothing.
         let mut other = begin();
-        let before = other.1.to_bytes().unwrap();
-        let mut refused = |bytes: &[u8], settings: &str| other.0.resume(&mut other.1, bytes, settings).unwrap_err();
+        let before = bytes(&other);
+        let mut refused = |bytes: &[u8], settings: &str| other.resume(bytes, settings).unwrap_err();
         assert!(refused(&state, "another take").contains("another take"));
         assert!(refused(b"", "a take").contains("no state of a fit"));
         assert!(refused(&before, "a take").contains("no state of a fit"));
@@ -130,7 +136,7 @@ fn a_fit_that_was_killed_ends_as_one_that_was_not() {
         let last = poisoned.len() - 4;
         poisoned[last..].copy_from_slice(&f32::NAN.to_le_bytes());
         assert!(refused(&poisoned, "a take").contains("is damaged"));
-        assert!(before == other.1.to_bytes().unwrap());
+        assert!(before == bytes(&other));
     }
 }
 
@@ -148,11 +154,10 @@ fn wrong_poses_are_corrected() {
         frame.pose.root_translation += DVec3::X * turn * 0.2;
     }
     let run = |refine_poses: bool| {
-        let mut ours = truth.clone();
-        let settings = FitSettings { refine_poses, skin_correction: false, ..FitSettings::default() };
-        let mut fit = Fit::new(&gpu, &ours, wrong.clone(), views.clone(), settings).unwrap();
+        let settings = AvatarFitSettings { refine_poses, ..AvatarFitSettings::default() };
+        let mut fit = fit_of(&gpu, AvatarModel::new(truth.clone(), wrong.clone(), settings), &views);
         for step in 0..300 {
-            fit.step(&mut ours, step as f32 / 300.0).unwrap();
+            fit.step(step as f32 / 300.0).unwrap();
         }
         // Shoulder and upper arm may share a turn: what counts is where it brings the wrist.
         let wrists = |pose: &Pose| {
@@ -161,11 +166,11 @@ fn wrong_poses_are_corrected() {
         };
         let mut off = 0.0;
         for (i, frame) in frames.iter().enumerate() {
-            let (found, right) = (wrists(&fit.pose(i).unwrap()), wrists(&frame.pose));
+            let (found, right) = (wrists(&fit.model().pose(i).unwrap()), wrists(&frame.pose));
             off += found.iter().zip(&right).map(|(found, right)| found.distance(*right)).sum::<f64>() / 4.0;
         }
-        assert!(fit.pose(frames.len()).is_none());
-        (off, fit.decibels(&ours).unwrap())
+        assert!(fit.model().pose(frames.len()).is_none());
+        (off, fit.decibels().unwrap())
     };
     let (without, with) = (run(false), run(true));
     assert!(without.0 > 0.02 && with.0 < 0.4 * without.0, "{without:?} {with:?}");
@@ -173,24 +178,14 @@ fn wrong_poses_are_corrected() {
 }
 
 #[test]
-fn images_that_show_nobody_and_frames_that_are_missing_are_refused() {
+fn a_broken_avatar_stays_where_it_is() {
     let gpu = flyrig_gpu::testing::device().on_processor();
-    let ours = avatar(|_| [0.2; 3], 1000);
-    let all = vec![255; SIZE as usize * SIZE as usize * 4];
-    assert!(TrainingView::cut(0, &camera(0.0), &[]).is_none());
-    assert!(TrainingView::cut(0, &camera(0.0), &vec![0; all.len()]).is_none());
-    let refused = |views: Vec<TrainingView>| match Fit::new(&gpu, &ours, Vec::new(), views, FitSettings::default()) {
-        Err(AvatarError::Images(text)) => text,
-        other => panic!("{other:?}"),
-    };
-    assert!(refused(Vec::new()).contains("no person is in any image"));
-    assert!(refused(vec![TrainingView::cut(3, &camera(0.0), &all).unwrap()]).contains("without a pose"));
-    // A broken avatar stays where it is; the image that fills everything is cut to itself.
-    let mut broken = ours.clone();
+    let mut broken = avatar(|_| [0.2; 3], 1000);
     broken.parameters.shape.fill([f32::NAN; 4]);
-    let frames = vec![TrainingFrame { pose: ours.template.skeleton.rest_pose(), translations: Vec::new() }];
-    let views = vec![TrainingView::cut(0, &camera(0.0), &all).unwrap()];
-    let mut fit = Fit::new(&gpu, &broken, frames, views, FitSettings::default()).unwrap();
-    assert!(fit.step(&mut broken, f32::NAN).unwrap().loss.is_finite());
-    broken.to_bytes().unwrap_err();
+    let frames = vec![TrainingFrame { pose: broken.template.skeleton.rest_pose(), translations: Vec::new() }];
+    let all = vec![255; SIZE as usize * SIZE as usize * 4];
+    let views = [TrainingView::cut(0, &camera(0.0), &all).unwrap()];
+    let mut fit = fit_of(&gpu, AvatarModel::new(broken, frames, AvatarFitSettings::default()), &views);
+    assert!(fit.step(f32::NAN).unwrap().loss.is_finite());
+    fit.into_model().into_avatar().to_bytes().unwrap_err();
 }

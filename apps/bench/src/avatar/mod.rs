@@ -13,8 +13,9 @@ use std::{
 
 use anyhow::{Context, Result};
 use clap::{Args, builder::TypedValueParser as _};
-use flyrig_avatar::{Avatar, AvatarScene, Bones, Fit, FitSettings};
+use flyrig_avatar::{Avatar, AvatarFitSettings, AvatarModel, AvatarScene, Bones};
 use flyrig_body::DEFAULT_GAUSSIAN_COUNT;
+use flyrig_fit::Fit;
 use flyrig_fusion::{BudgetSettings, Origin, Outcome, PersonId, Solver, resident_mib};
 use flyrig_gpu::GpuContext;
 use flyrig_metrics::{CameraScore, ScoreSheet, score_view};
@@ -279,14 +280,15 @@ fn fit(
     rows: &mut Vec<Row>,
 ) -> Result<Cost> {
     let AvatarTake { frames, views, uvs, .. } = take;
-    let mut avatar = take.avatar.clone();
-    let gaussians = avatar.gaussians();
-    let mut scene = AvatarScene::new(gpu, &avatar)?;
-    let settings = variant.fit_settings(FitSettings { pull: args.pull, ..FitSettings::default() });
-    let mut fit = Fit::new(gpu, &avatar, frames.clone(), views.clone(), settings)?;
+    let gaussians = take.avatar.gaussians();
+    let mut scene = AvatarScene::new(gpu, &take.avatar)?;
+    let settings = variant.avatar_settings(AvatarFitSettings { pull: args.pull, ..AvatarFitSettings::default() });
+    let mut model = AvatarModel::new(take.avatar.clone(), frames.clone(), settings);
+    let settings = variant.fit_settings();
     if let Some(local) = variant.local_settings() {
-        fit.use_networks(&mut avatar, uvs, &local)?;
+        model.use_networks(uvs, &local, settings.seed)?;
     }
+    let mut fit = Fit::new(gpu, model, views.clone(), settings)?;
     let by_steps = !args.steps.is_empty();
     let ends: Vec<f64> =
         if by_steps { args.steps.iter().map(|&steps| steps as f64).collect() } else { args.seconds.clone() };
@@ -301,18 +303,20 @@ fn fit(
                 break;
             }
             let start = Instant::now();
-            fit.step(&mut avatar, (done / end) as f32)?;
+            fit.step((done / end) as f32)?;
             spent += start.elapsed().as_secs_f64();
             steps += 1;
             bar.set_position(done as u64);
         }
-        let view = scored((&avatar, &mut scene), held, cameras, true)?;
-        let (pose, _) = scored((&avatar, &mut scene), novel, cameras, false)?;
+        let avatar = fit.model().avatar();
+        let view = scored((avatar, &mut scene), held, cameras, true)?;
+        let (pose, _) = scored((avatar, &mut scene), novel, cameras, false)?;
         bar.set_message(format!("{} {gaussians}: {:.2} and {:.2} dB", variant.name(), view.0.psnr_db, pose.psnr_db));
         (times, psnr_db) = (view.1, view.0.psnr_db);
         rows.push(Row { variant: variant.name(), gaussians, seconds: spent, steps, view: view.0, pose });
     }
     bar.finish_and_clear();
+    let avatar = fit.into_model().into_avatar();
     let poses: Vec<_> = held.iter().map(|held| (&held.pose, held.translations.as_slice())).collect();
     let small = small_views(gpu, &avatar, &poses, cameras)?;
     Ok(Cost {

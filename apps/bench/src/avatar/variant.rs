@@ -1,7 +1,8 @@
 //! Variants of the fit of an avatar, the rows of the ablation tables.
 
 use clap::ValueEnum;
-use flyrig_avatar::{AtlasLayout, ErrorWeights, FitSettings, LocalSettings};
+use flyrig_avatar::{AtlasLayout, AvatarFitSettings, LocalSettings};
+use flyrig_fit::{ErrorWeights, FitSettings};
 
 /// A variant of the fit.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, ValueEnum)]
@@ -55,16 +56,23 @@ impl Variant {
         self.to_possible_value().map_or_else(String::new, |value| value.get_name().to_owned())
     }
 
-    /// Returns the settings of the fit, `base` changed by the variant.
-    pub fn fit_settings(self, base: FitSettings) -> FitSettings {
-        let sharp = ErrorWeights { sharpness: 1.0, ..ErrorWeights::default() };
+    /// Returns the settings of the fit.
+    pub fn fit_settings(self) -> FitSettings {
+        let sharpness = match self {
+            Self::Sharpen | Self::LogavatarSharpen => 1.0,
+            _ => 0.0,
+        };
+        FitSettings { weights: ErrorWeights { sharpness, ..ErrorWeights::default() }, ..FitSettings::default() }
+    }
+
+    /// Returns the settings of the avatar in the fit, `base` changed by the variant.
+    pub fn avatar_settings(self, base: AvatarFitSettings) -> AvatarFitSettings {
         match self {
-            Self::NoLight | Self::LogavatarNoLight => FitSettings { light: false, ..base },
-            Self::NoPull | Self::LogavatarNoPull => FitSettings { pull: 0.0, ..base },
-            Self::RefinePoses => FitSettings { refine_poses: true, ..base },
-            Self::SkinCorrection => FitSettings { skin_correction: true, ..base },
-            Self::RefineBoth => FitSettings { refine_poses: true, skin_correction: true, ..base },
-            Self::Sharpen | Self::LogavatarSharpen => FitSettings { weights: sharp, ..base },
+            Self::NoLight | Self::LogavatarNoLight => AvatarFitSettings { light: false, ..base },
+            Self::NoPull | Self::LogavatarNoPull => AvatarFitSettings { pull: 0.0, ..base },
+            Self::RefinePoses => AvatarFitSettings { refine_poses: true, ..base },
+            Self::SkinCorrection => AvatarFitSettings { skin_correction: true, ..base },
+            Self::RefineBoth => AvatarFitSettings { refine_poses: true, skin_correction: true, ..base },
             _ => base,
         }
     }
@@ -93,7 +101,8 @@ mod tests {
     #[test]
     fn every_variant_but_the_first_changes_something_of_its_own() {
         let of = |variant: Variant| {
-            format!("{:?} {:?}", variant.fit_settings(FitSettings::default()), variant.local_settings())
+            let avatar = variant.avatar_settings(AvatarFitSettings::default());
+            format!("{:?} {avatar:?} {:?}", variant.fit_settings(), variant.local_settings())
         };
         let mut all: Vec<String> = Variant::value_variants().iter().map(|&variant| of(variant)).collect();
         let count = all.len();

@@ -2,13 +2,14 @@
 
 use std::{
     path::{Path, PathBuf},
-    time::{Duration, Instant},
+    time::Instant,
 };
 
 use anyhow::{Context as _, Result, ensure};
 use clap::{Args, ValueEnum};
-use flyrig_avatar::{Avatar, AvatarScene, Bones, Card, Fit, FitSettings, LocalSettings, TrainingFrame};
+use flyrig_avatar::{Avatar, AvatarFitSettings, AvatarModel, AvatarScene, Bones, Card, LocalSettings, TrainingFrame};
 use flyrig_body::DEFAULT_NODE_COUNT;
+use flyrig_fit::{Fit, FitSettings, Length, Run};
 use flyrig_fusion::BodySettings;
 use flyrig_gpu::GpuContext;
 use flyrig_renderer::HarmonicOrder;
@@ -87,40 +88,25 @@ fn parse_pull(text: &str) -> Result<f32, String> {
     }
 }
 
-/// Number of steps from which the time of a step is measured.
-const MEASURED_STEPS: u64 = 20;
-/// Steps between updates of the progress.
-const SHOW_EVERY: u64 = 20;
-/// Steps and time between two checkpoints.
-const SAVE_STEPS: u64 = 500;
-const SAVE_EVERY: Duration = Duration::from_secs(30);
-/// Number of images written while the avatar is fitted.
-const PICTURES: u64 = 10;
-
 /// Runs the command.
 pub fn build(args: &AvatarBuildArgs, gpu: &GpuContext) -> Result<()> {
     let folder = args.out.parent().filter(|folder| !folder.as_os_str().is_empty()).unwrap_or(Path::new("."));
     ensure!(folder.is_dir(), "the folder {} does not exist; make it, or choose another --out", folder.display());
     let args = &AvatarBuildArgs { take: args.take.resolve("avatar build", &[], gpu)?, ..args.clone() };
-    let AvatarTake { frames, views, mut avatar, uvs, numbers, camera } = track(args, gpu)?;
+    let AvatarTake { frames, views, avatar, uvs, numbers, camera } = track(args, gpu)?;
     let first = frames.first().cloned().context("no frame")?;
     let scene = AvatarScene::new(gpu, &avatar)?;
     let mut preview = Preview { scene, first, camera, path: args.out.with_extension("png") };
     preview.draw(&avatar)?;
-    let mut fit = Fit::new(
-        gpu,
-        &avatar,
-        frames,
-        views,
-        FitSettings { seed: args.seed, pull: args.pull, light: args.light, ..FitSettings::default() },
-    )?;
-    let local = LocalSettings::default();
+    let settings = AvatarFitSettings { pull: args.pull, light: args.light, ..AvatarFitSettings::default() };
+    let mut model = AvatarModel::new(avatar, frames, settings);
     if args.method == Method::LogAvatar {
-        let numbers = fit.use_networks(&mut avatar, &uvs, &local)?;
+        let numbers = model.use_networks(&uvs, &LocalSettings::default(), args.seed)?;
         println!("local networks of {numbers} numbers");
-        preview.draw(&avatar)?;
+        preview.draw(model.avatar())?;
     }
-    Building::start(args, fit, avatar, preview)?.run(numbers)
+    let fit = Fit::new(gpu, model, views, FitSettings { seed: args.seed, ..FitSettings::default() })?;
+    Building::start(args, fit, preview)?.run(numbers)
 }
 
 /// Tracks the person of the take.
@@ -165,52 +151,43 @@ impl Preview {
 /// Avatar that is being fitted.
 struct Building<'a> {
     args: &'a AvatarBuildArgs,
-    fit: Fit,
-    avatar: Avatar,
+    fit: Fit<AvatarModel>,
     preview: Preview,
     state: Checkpoint,
-    /// Number of steps so far.
-    done: u64,
-    /// Number of all steps; `None` until the time of a step has been measured.
-    total: Option<u64>,
-    started: Instant,
-    /// Number of steps before this run.
-    resumed_at: u64,
+    course: Run,
     /// Mean PSNR of the training images before this run, dB.
     before_db: f64,
 }
 
 impl<'a> Building<'a> {
     /// Starts the fit, or resumes it from its checkpoint.
-    fn start(args: &'a AvatarBuildArgs, mut fit: Fit, mut avatar: Avatar, preview: Preview) -> Result<Self> {
+    fn start(args: &'a AvatarBuildArgs, mut fit: Fit<AvatarModel>, preview: Preview) -> Result<Self> {
         let state = Checkpoint::new(&args.out, format!("{} images, {args:?}", fit.images()));
-        let (done, total) = match state.resume(&mut fit, &mut avatar)? {
-            Some(progress) => (progress.done, Some(progress.total)),
-            None => (0, args.steps),
-        };
-        let before_db = fit.decibels(&avatar)?;
-        let started = Instant::now();
-        Ok(Self { args, fit, avatar, preview, state, done, total, started, resumed_at: done, before_db })
+        let resumed = state.resume(&mut fit)?;
+        let before_db = fit.decibels()?;
+        let length = args.steps.map_or(Length::Minutes(args.minutes), Length::Steps);
+        Ok(Self { args, fit, preview, state, course: Run::new(length, resumed.as_ref()), before_db })
     }
 
     /// Fits until the last step or Ctrl-C, and writes the avatar. `numbers` are the take's first frame, and its last one plus 1.
     fn run(mut self, numbers: [u64; 2]) -> Result<()> {
         self.fit_until_end()?;
-        if let Some(total) = self.total.filter(|total| self.done < *total) {
-            self.state.save(&mut self.fit, &mut self.avatar, total)?;
-            println!("stopped after {} of {total} steps; the same command goes on from there", self.done);
+        let (done, seconds, step_seconds) = (self.course.done(), self.course.seconds(), self.course.step_seconds());
+        if let Some(total) = self.course.total().filter(|total| done < *total) {
+            self.state.save(&mut self.fit, total)?;
+            println!("stopped after {done} of {total} steps; the same command goes on from there");
         }
-        let seconds = self.started.elapsed().as_secs_f64();
-        let training_db = self.fit.decibels(&self.avatar)?;
-        self.avatar.card = self.card(numbers, training_db);
-        self.avatar.save(&self.args.out)?;
-        if self.total.is_none_or(|total| self.done >= total) {
+        let training_db = self.fit.decibels()?;
+        let card = self.card(numbers, training_db);
+        let mut avatar = self.fit.into_model().into_avatar();
+        avatar.card = card;
+        avatar.save(&self.args.out)?;
+        if self.course.total().is_none_or(|total| done >= total) {
             self.state.remove()?;
         }
         println!(
-            "{} steps in {seconds:.0} s ({:.1} ms each); training images {:.2} -> {training_db:.2} dB; {} ({:.1} MB) and {}",
-            self.done,
-            1e3 * seconds / (self.done - self.resumed_at).max(1) as f64,
+            "{done} steps in {seconds:.0} s ({:.1} ms each); training images {:.2} -> {training_db:.2} dB; {} ({:.1} MB) and {}",
+            1e3 * step_seconds,
             self.before_db,
             self.args.out.display(),
             std::fs::metadata(&self.args.out).map_or(0.0, |file| file.len() as f64 / 1e6),
@@ -220,43 +197,26 @@ impl<'a> Building<'a> {
     }
 
     fn fit_until_end(&mut self) -> Result<()> {
-        let mut saved = (Instant::now(), self.done);
-        let bar = progress_bar(self.total.unwrap_or(MEASURED_STEPS), "avatar build");
-        bar.set_position(self.done);
-        let (mut sum, mut pictured) = (0.0, 0);
-        while self.total.is_none_or(|total| self.done < total) && !stop::requested() {
-            let progress = self.total.map_or(0.0, |total| self.done as f32 / total as f32);
-            sum += self.fit.step(&mut self.avatar, progress)?.decibels;
-            self.done += 1;
-            if self.total.is_none() && self.done == MEASURED_STEPS {
-                let all = self.measured_total();
-                bar.set_length(all);
-                self.total = Some(all);
+        let bar = progress_bar(self.course.total().unwrap_or_default(), "avatar build");
+        bar.set_position(self.course.done());
+        while !self.course.is_done() && !stop::requested() {
+            let due = self.course.step(&mut self.fit)?;
+            if let Some(total) = self.course.total() {
+                bar.set_length(total);
+                if due.checkpoint {
+                    self.state.save(&mut self.fit, total)?;
+                }
             }
-            let is_due = self.done >= saved.1 + SAVE_STEPS || saved.0.elapsed() > SAVE_EVERY;
-            if let Some(total) = self.total.filter(|_| is_due) {
-                self.state.save(&mut self.fit, &mut self.avatar, total)?;
-                saved = (Instant::now(), self.done);
+            if let Some(decibels) = due.decibels {
+                bar.set_message(format!("{decibels:.1} dB, {}", self.preview.path.display()));
+                bar.set_position(self.course.done());
             }
-            if self.done.is_multiple_of(SHOW_EVERY) {
-                bar.set_message(format!("{:.1} dB, {}", sum / SHOW_EVERY as f64, self.preview.path.display()));
-                bar.set_position(self.done);
-                sum = 0.0;
-            }
-            let tenth = self.total.map_or(0, |total| PICTURES * self.done / total);
-            if tenth > pictured {
-                pictured = tenth;
-                self.preview.draw(&self.avatar)?;
+            if due.picture {
+                self.preview.draw(self.fit.model().avatar())?;
             }
         }
         bar.finish_and_clear();
         Ok(())
-    }
-
-    /// Returns the number of steps that fit into the minutes of the arguments.
-    fn measured_total(&self) -> u64 {
-        let step_secs = self.started.elapsed().as_secs_f64() / self.done as f64;
-        ((self.args.minutes * 60.0 / step_secs) as u64).max(self.done)
     }
 
     fn card(&self, frames: [u64; 2], training_db: f64) -> Card {
@@ -268,7 +228,7 @@ impl<'a> Building<'a> {
             frames,
             pose: format!("{:?}", take.perception.settings.pose).to_lowercase(),
             masks: format!("{:?}", take.perception.settings.masks).to_lowercase(),
-            steps: self.done,
+            steps: self.course.done(),
             seed: self.args.seed,
             training_db,
             edits: Vec::new(),

@@ -3,7 +3,7 @@
 use std::path::{Path, PathBuf};
 
 use anyhow::{Context as _, Result};
-use flyrig_avatar::{Avatar, Fit, FitProgress};
+use flyrig_fit::{Fit, FitProgress, Model};
 use flyrig_report::write_whole;
 
 /// Ending of the file's name.
@@ -23,12 +23,12 @@ impl Checkpoint {
     }
 
     /// Resumes from the file if there is one of the same build; ignores that of another build with a warning.
-    pub fn resume(&self, fit: &mut Fit, avatar: &mut Avatar) -> Result<Option<FitProgress>> {
+    pub fn resume<M: Model>(&self, fit: &mut Fit<M>) -> Result<Option<FitProgress>> {
         if !self.path.exists() {
             return Ok(None);
         }
         let bytes = std::fs::read(&self.path).with_context(|| format!("cannot read {}", self.path.display()))?;
-        match fit.resume(avatar, &bytes, &self.settings) {
+        match fit.resume(&bytes, &self.settings) {
             Ok(progress) => {
                 println!("going on after {} of {} steps, from {}", progress.done, progress.total, self.path.display());
                 Ok(Some(progress))
@@ -41,8 +41,8 @@ impl Checkpoint {
     }
 
     /// Writes the state, whole or not at all.
-    pub fn save(&self, fit: &mut Fit, avatar: &mut Avatar, total: u64) -> Result<()> {
-        write_whole(&self.path, &fit.checkpoint(avatar, &self.settings, total)?)
+    pub fn save<M: Model>(&self, fit: &mut Fit<M>, total: u64) -> Result<()> {
+        write_whole(&self.path, &fit.checkpoint(&self.settings, total)?)
     }
 
     /// Removes the file of a finished build.

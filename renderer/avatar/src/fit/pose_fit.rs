@@ -184,8 +184,8 @@ mod tests {
     use crate::fit::skinning::reference::loss;
     use crate::model::avatar::Avatar;
     use crate::model::avatar::tests::{random_pose, small};
-    use crate::model::parameters::Element;
     use crate::model::posing::{Bones, PosedAvatar};
+    use flyrig_fit::Element;
 
     /// Returns random corrections of three frames.
     fn random_fit(avatar: &Avatar) -> PoseFit {

@@ -7,9 +7,9 @@
 use flyrig_body::SkinWeights;
 use rayon::prelude::*;
 
-use crate::fit::adam::Adam;
-use crate::model::neighbors::Neighbors;
-use crate::model::parameters::Element;
+use flyrig_fit::Element;
+use flyrig_fit::Neighbors;
+use flyrig_learn::ColumnAdam;
 
 /// Rates at the start and at the end.
 const RATE: [f32; 2] = [2e-2, 2e-3];
@@ -26,14 +26,14 @@ pub(crate) struct SkinFit {
     template: Vec<SkinWeights>,
     /// Logarithms of the factors, per Gaussian and entry of its list of weights.
     pub factors: Vec<Element>,
-    pub adam: Adam,
+    pub adam: ColumnAdam<4>,
 }
 
 impl SkinFit {
     /// Starts without corrections.
     pub fn new(template: &[SkinWeights]) -> Self {
         let factors = vec![[0.0; 4]; template.len()];
-        Self { template: template.to_vec(), adam: Adam::new(factors.len()), factors }
+        Self { template: template.to_vec(), adam: ColumnAdam::new(factors.len()), factors }
     }
 
     /// Descends by one step, the `count`th from 1, along dL/d factors; `progress` in 0..=1 is the completed share of

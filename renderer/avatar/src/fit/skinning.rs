@@ -8,8 +8,8 @@ use glam::{DQuat, DVec3, DVec4, Quat, Vec3, Vec4};
 use rayon::prelude::*;
 
 use crate::model::avatar::Avatar;
-use crate::model::parameters::Element;
 use crate::model::posing::{Bones, PosedAvatar};
+use flyrig_fit::Element;
 
 /// Gaussians per task.
 const CHUNK: usize = 4096;

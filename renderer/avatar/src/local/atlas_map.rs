@@ -6,7 +6,7 @@ use glam::{Vec2, Vec3};
 use rayon::prelude::*;
 
 use crate::error::AvatarError;
-use crate::model::parameters::Element;
+use flyrig_fit::Element;
 
 /// Layout of the surface in the atlas.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
@@ -43,7 +43,7 @@ impl AtlasMap {
             AtlasLayout::Uv => {
                 let first = uvs.first().copied().unwrap_or_default();
                 if uvs.len() != places.len() || (uvs.len() > 1 && uvs.iter().all(|uv| *uv == first)) {
-                    return Err(AvatarError::Images(
+                    return Err(AvatarError::Networks(
                         "the body has no texture coordinates; use --atlas front-back, or a body with a texture"
                             .to_owned(),
                     ));

@@ -26,7 +26,8 @@ use crate::local::texture;
 
 use crate::error::AvatarError;
 use crate::model::avatar::Avatar;
-use crate::model::parameters::{Element, GaussianParameters};
+use crate::model::parameters::GaussianParameters;
+use flyrig_fit::Element;
 
 /// Decay rates of Adam's moments.
 const BETAS: [f32; 2] = [0.9, 0.99];

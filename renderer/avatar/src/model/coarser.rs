@@ -6,8 +6,9 @@ use nalgebra::{Matrix3, SymmetricEigen, Vector3};
 use rayon::prelude::*;
 
 use crate::model::avatar::Avatar;
-use crate::model::neighbors::Neighbors;
-use crate::model::parameters::{Element, GaussianParameters};
+use crate::model::parameters::GaussianParameters;
+use flyrig_fit::Element;
+use flyrig_fit::Neighbors;
 
 /// Least cosine between two normals of one surface: the sides of a sleeve stay apart.
 const SAME_SIDE: f32 = 0.5;

@@ -8,7 +8,7 @@ use flyrig_learn::{AdamStep, Moments};
 use flyrig_model::light::{self, SHADE, TERMS, Terms};
 use glam::Vec3;
 
-use crate::model::parameters::Element;
+use flyrig_fit::Element;
 
 /// Rates at the start and at the end.
 const RATE: [f32; 2] = [1e-2, 1e-3];

@@ -1,10 +1,8 @@
 //! Learned attributes of an avatar's Gaussians, in canonical space.
 
+use flyrig_fit::Element;
 use flyrig_renderer::HarmonicOrder;
 use rayon::prelude::*;
-
-/// Element of every list: four numbers.
-pub(crate) type Element = [f32; 4];
 
 /// Learned attributes: one row per Gaussian, and one row of harmonics per coefficient. Derivatives have the same form.
 #[derive(Debug, Clone, PartialEq)]

@@ -9,7 +9,8 @@ use glam::{DMat4, DVec3, Mat3, Mat4, Quat, Vec3, Vec4};
 use rayon::prelude::*;
 
 use crate::model::avatar::Avatar;
-use crate::model::parameters::{Element, GaussianParameters};
+use crate::model::parameters::GaussianParameters;
+use flyrig_fit::Element;
 
 /// Bounds of drawn scales, metres.
 const SCALE_M: std::ops::RangeInclusive<f32> = 2e-4..=0.1;

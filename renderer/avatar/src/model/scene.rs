@@ -7,8 +7,8 @@ use flyrig_types::{Camera, Pose, RenderedView};
 use glam::{DVec2, DVec3};
 
 use crate::model::avatar::{Attachment, Avatar};
-use crate::model::parameters::Element;
 use crate::model::posing::{Bones, PosedAvatar};
+use flyrig_fit::Element;
 
 /// Posed avatar on the adapter, as seen from one camera.
 #[derive(Debug)]

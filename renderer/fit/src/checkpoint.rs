@@ -5,9 +5,9 @@ use std::collections::HashMap;
 use safetensors::{Dtype, SafeTensors, tensor::TensorView};
 use serde::{Deserialize, Serialize};
 
-use crate::error::AvatarError;
-use crate::fit::descent::Fit;
-use crate::model::avatar::Avatar;
+use crate::descent::Fit;
+use crate::error::FitError;
+use crate::model::Model;
 
 /// Key of the description in the file's metadata.
 const HEADER: &str = "flyrig-fit";
@@ -23,16 +23,17 @@ pub struct FitProgress {
     pub total: u64,
 }
 
-impl Fit {
-    /// Returns the state after the last step, including the avatar, as a file's bytes.
+impl<M: Model> Fit<M> {
+    /// Returns the state after the last step, the model's included, as a file's bytes. `settings` describes all that the
+    /// result depends on, `total` is the number of all steps.
     ///
     /// # Errors
-    /// [`AvatarError::Format`] for a description that cannot be serialised.
-    pub fn checkpoint(&mut self, avatar: &mut Avatar, settings: &str, total: u64) -> Result<Vec<u8>, AvatarError> {
-        let fail = |problem: String| AvatarError::Format { path: "checkpoint".into(), problem };
+    /// [`FitError::Checkpoint`] for a description that cannot be serialised.
+    pub fn checkpoint(&mut self, settings: &str, total: u64) -> Result<Vec<u8>, FitError> {
+        let fail = |problem: String| FitError::Checkpoint(problem);
         let progress = FitProgress { settings: settings.to_owned(), done: self.step, total };
         let header = serde_json::to_string(&progress).map_err(|error| fail(error.to_string()))?;
-        let state = self.state(avatar);
+        let state = self.model.state();
         let views: Vec<_> = state
             .iter()
             .map(|(name, values)| {
@@ -49,7 +50,7 @@ impl Fit {
     ///
     /// # Errors
     /// A text where the bytes are no state, are damaged, or belong to another take or other settings.
-    pub fn resume(&mut self, avatar: &mut Avatar, bytes: &[u8], settings: &str) -> Result<FitProgress, String> {
+    pub fn resume(&mut self, bytes: &[u8], settings: &str) -> Result<FitProgress, String> {
         let none = || "is no state of a fit".to_owned();
         let (_, metadata) = SafeTensors::read_metadata(bytes).map_err(|_| none())?;
         let header = metadata.metadata().as_ref().and_then(|all| all.get(HEADER)).ok_or_else(none)?;
@@ -63,7 +64,7 @@ impl Fit {
             let values: Vec<f32> = tensor.data().chunks_exact(4).map(bytemuck::pod_read_unaligned).collect();
             found.insert(name.to_owned(), values);
         }
-        let state = self.state(avatar);
+        let state = self.model.state();
         for (name, own) in &state {
             let belongs =
                 |values: &&Vec<f32>| values.len() == own.len() && values.iter().all(|value| value.is_finite());
@@ -75,41 +76,7 @@ impl Fit {
             }
         }
         self.step = progress.done;
-        if let Some(skin) = &self.skin {
-            skin.bake(&mut avatar.skin);
-        }
-        if let Some(local) = &mut self.local {
-            local.resume(progress.done, &mut avatar.parameters);
-        }
+        self.model.restore(progress.done);
         Ok(progress)
-    }
-
-    /// Returns all numbers that change from step to step, by name.
-    fn state<'a>(&'a mut self, avatar: &'a mut Avatar) -> Vec<(String, &'a mut [f32])> {
-        let mut all = Vec::new();
-        for (number, list) in avatar.parameters.lists_mut().into_iter().enumerate() {
-            all.push((format!("list.{number}"), list.as_flattened_mut()));
-        }
-        all.push(("light".to_owned(), avatar.light.terms.as_flattened_mut()));
-        for (number, moment) in self.light.moments.iter_mut().enumerate() {
-            all.push((format!("light.{number}"), moment.as_mut_slice()));
-        }
-        if let Some(poses) = &mut self.poses {
-            all.push(("poses".to_owned(), poses.corrections.as_mut_slice()));
-            all.push(("poses.squares".to_owned(), poses.squares.as_mut_slice()));
-        }
-        if let Some(skin) = &mut self.skin {
-            all.push(("skin".to_owned(), skin.factors.as_flattened_mut()));
-            for (k, list) in skin.adam.lists_mut().into_iter().enumerate() {
-                all.push((format!("skin.adam.{k}"), list.as_flattened_mut()));
-            }
-        }
-        for (number, adam) in self.moments.iter_mut().enumerate() {
-            for (k, list) in adam.lists_mut().into_iter().enumerate() {
-                all.push((format!("adam.{k}.{number}"), list.as_flattened_mut()));
-            }
-        }
-        all.extend(self.local.iter_mut().flat_map(|local| local.state()));
-        all
     }
 }

@@ -2,8 +2,8 @@
 
 use flyrig_types::Camera;
 
-use crate::fit::image_error::Photograph;
-use crate::fit::outline::mixed;
+use crate::image_error::Photograph;
+use crate::outline::mixed;
 
 /// Margin around the person, pixels.
 const MARGIN_PX: u32 = 12;

@@ -4,17 +4,18 @@
 use glam::Vec3;
 use rayon::prelude::*;
 
-use crate::model::parameters::Element;
+use crate::model::Element;
 
 /// Number of neighbours per Gaussian.
 const NEAREST: usize = 6;
 
 /// Nearest Gaussians of each Gaussian.
 #[derive(Debug, Clone)]
-pub(crate) struct Neighbors(Vec<[u32; NEAREST]>);
+pub struct Neighbors(Vec<[u32; NEAREST]>);
 
 impl Neighbors {
     /// Finds neighbours by canonical positions. With fewer Gaussians than neighbours, a Gaussian is its own neighbour.
+    #[must_use]
     pub fn new(places: &[Vec3]) -> Self {
         // Sorted by height, those within the distance of the worst so far are near in the order.
         let mut order: Vec<u32> = (0..places.len() as u32).collect();
@@ -29,6 +30,7 @@ impl Neighbors {
     }
 
     /// Returns the nearest others of a Gaussian, nearest first.
+    #[must_use]
     pub fn of(&self, i: usize) -> &[u32] {
         self.0.get(i).map_or(&[], |nearest| nearest.as_slice())
     }

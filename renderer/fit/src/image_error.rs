@@ -8,7 +8,7 @@ use flyrig_model::srgb;
 use flyrig_renderer::srgb_from_linear;
 use rayon::prelude::*;
 
-use crate::fit::ssim::{Blur, ssim};
+use crate::ssim::{Blur, ssim};
 
 /// Coverage below which a pixel has no colour.
 const CLEAR: f32 = 1.0 / 512.0;
