@@ -177,14 +177,14 @@ fn models_are_given_the_derivatives_of_the_reported_loss() {
     for (list, step) in [(0, 1e-3f32), (1, 1e-3), (3, 2e-2)] {
         let (mut worst, mut most) = (0.0f64, 0.0f64);
         for i in (0..COUNT).step_by(5) {
-            for k in 0..3 {
+            for (k, found) in slopes[list][i].into_iter().enumerate().take(3) {
                 let at = |by: f32| {
                     let mut moved = lists.clone();
                     moved.0[list][i][k] += by;
                     loss(moved).0
                 };
                 let expected = (at(step) - at(-step)) / f64::from(2.0 * step);
-                worst = worst.max((expected - f64::from(slopes[list][i][k])).abs());
+                worst = worst.max((expected - f64::from(found)).abs());
                 most = most.max(expected.abs());
             }
         }
