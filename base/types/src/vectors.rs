@@ -10,8 +10,8 @@ const VARIABLE: &str = "FLYRIG_VECTORS";
 /// benefit from them.
 ///
 /// `FLYRIG_VECTORS=avx2` leaves AVX-512 out, `FLYRIG_VECTORS=none` leaves all of them out: for tests and benchmarks of other
-/// processors. It is read once and limits x86 processors only. The pose network's products, which a library computes, are
-/// not limited.
+/// processors. It is read once and limits x86 processors only. Products that a library
+/// computes for the networks are not limited.
 #[inline]
 pub fn vectorized<W: pulp::WithSimd>(work: W) -> W::Output {
     instructions().dispatch(work)

@@ -11,9 +11,9 @@ use pulp::{Simd, WithSimd};
 use tract_linalg::multithread::par_chunks_mut;
 use tract_onnx::prelude::*;
 use tract_onnx::tract_core::internal::*;
-use tract_onnx::tract_core::ops::binary::TypedBinOp;
 use tract_onnx::tract_core::ops::cnn::{Conv, KernelFormat};
-use tract_onnx::tract_core::ops::math::{Max, Min};
+
+use crate::network::clip::{Clip, clipped};
 
 /// Operator that filters each plane of an `f32` tensor (its last two axes are rows and columns) by its own kernel, adds a bias and clips.
 #[derive(Debug, Clone, Hash, PartialEq, Eq)]
@@ -22,8 +22,7 @@ struct Depthwise {
     kernels: Arc<Tensor>,
     /// Added to each pixel, one number per channel.
     biases: Arc<Tensor>,
-    /// Least and greatest value of the output.
-    range: Arc<Tensor>,
+    clip: Clip,
     geometry: Geometry,
 }
 
@@ -47,7 +46,7 @@ pub(crate) fn replace_depthwise(model: &mut TypedModel) -> TractResult<()> {
         let node = model.node(id);
         let Some(conv) = node.op_as::<Conv>() else { continue };
         let Some(mut op) = Depthwise::of(conv, model, node)? else { continue };
-        let last = op.take_clips(model, id)?;
+        let last = op.clip.take(model, id)?;
         let mut patch = TypedModelPatch::default();
         let mut wire = patch.tap_model(model, node.inputs[0])?;
         // Where channels come last, tract moves the changes of axes into the products before and after.
@@ -102,36 +101,7 @@ impl Depthwise {
             side,
             stride,
         };
-        let range = tensor1(&[f32::NEG_INFINITY, f32::INFINITY]).into_arc_tensor();
-        Ok(Some(Self { kernels: kernels.clone(), biases: biases.clone(), range, geometry }))
-    }
-
-    /// Takes over the clips that follow the convolution `id`; returns the last node whose result this operator gives.
-    fn take_clips(&mut self, model: &TypedModel, id: usize) -> TractResult<usize> {
-        let mut last = id;
-        while let (false, &[next]) = (model.outputs.contains(&last.into()), &model.node(last).outputs[0].successors[..])
-        {
-            let node = model.node(next.node);
-            let Some(TypedBinOp(op, None)) = node.op_as::<TypedBinOp>() else { break };
-            let &other = &node.inputs[1 - next.slot];
-            let Some(bound) = model.outlet_fact(other)?.konst.as_ref().filter(|bound| bound.len() == 1) else { break };
-            let bound = bound.try_as_plain_ram()?.as_slice::<f32>()?[0];
-            let [low, high] = self.range()?;
-            let range = if op.is::<Max>() {
-                [low.max(bound), high.max(bound)]
-            } else if op.is::<Min>() {
-                [low.min(bound), high.min(bound)]
-            } else {
-                break;
-            };
-            self.range = tensor1(&range).into_arc_tensor();
-            last = next.node;
-        }
-        Ok(last)
-    }
-
-    fn range(&self) -> TractResult<[f32; 2]> {
-        Ok(*self.range.try_as_plain_ram()?.as_slice::<f32>()?.as_array().context("two bounds")?)
+        Ok(Some(Self { kernels: kernels.clone(), biases: biases.clone(), clip: Clip::NONE, geometry }))
     }
 }
 
@@ -198,7 +168,7 @@ struct Filter<'a, const TAPS: usize> {
     input: &'a [f32],
     kernels: &'a [[f32; TAPS]],
     biases: &'a [f32],
-    range: [f32; 2],
+    clip: Clip,
     /// Index of the first plane of `output` in `input`.
     first: usize,
     output: &'a mut [f32],
@@ -209,8 +179,8 @@ impl<const TAPS: usize> WithSimd for Filter<'_, TAPS> {
 
     #[inline(always)]
     fn with_simd<S: Simd>(self, simd: S) {
-        let Self { geometry, input, kernels, biases, range, first, output } = self;
-        let [low, high] = range.map(|bound| simd.splat_f32s(bound));
+        let Self { geometry, input, kernels, biases, clip, first, output } = self;
+        let range = clip.splat(simd);
         let phase = geometry.phase(S::F32_LANES);
         let taps = geometry.taps::<TAPS>(phase);
         let mut phases = vec![0.0; geometry.stride * geometry.stride * phase];
@@ -228,9 +198,7 @@ impl<const TAPS: usize> WithSimd for Filter<'_, TAPS> {
                 for (source, weight) in sources.iter().zip(kernel) {
                     value = simd.mul_add_e_f32s(source[at], weight, value);
                 }
-                // Keeps NaN, unlike a maximum.
-                value = simd.select_f32s(simd.less_than_f32s(value, low), low, value);
-                *sum = simd.select_f32s(simd.greater_than_f32s(value, high), high, value);
+                *sum = clipped(simd, value, range);
             }
             let rows = rows.chunks(geometry.row());
             for (output, row) in output.chunks_exact_mut(geometry.output[1]).zip(rows) {
@@ -276,10 +244,9 @@ impl Depthwise {
     fn filter<const TAPS: usize>(&self, input: &[f32], output: &mut [f32]) -> TractResult<()> {
         let kernels = self.kernels.try_as_plain_ram()?.as_slice::<f32>()?.as_chunks::<TAPS>().0;
         let biases = self.biases.try_as_plain_ram()?.as_slice::<f32>()?;
-        let range = self.range()?;
-        let (geometry, total) = (&self.geometry, output.len());
+        let (geometry, clip, total) = (&self.geometry, self.clip, output.len());
         par_chunks_mut(output, geometry.output.iter().product(), total, |first, output| {
-            flyrig_types::vectorized(Filter { geometry, input, kernels, biases, range, first, output });
+            flyrig_types::vectorized(Filter { geometry, input, kernels, biases, clip, first, output });
             Ok(())
         })
     }
@@ -299,6 +266,7 @@ impl TypedOp for Depthwise {
 
 #[cfg(test)]
 mod tests {
+    use tract_onnx::tract_core::ops::binary::TypedBinOp;
     use tract_onnx::tract_core::ops::cnn::{PaddingSpec, PoolSpec};
     use tract_onnx::tract_core::ops::math::{max, min};
     use tract_onnx::tract_core::ops::nn::DataFormat;

@@ -1,7 +1,7 @@
 //! Loads, runs and checks networks that take one crop of an image, through tract.
 //!
 //! Operations of the loaded network are replaced where tract's own are slow: depthwise convolutions
-//! ([`depthwise`](crate::network::depthwise)), bilinear doublings ([`upsample`](crate::network::upsample)), and the state of the
+//! ([`depthwise`](crate::network::depthwise)), those of 1x1 taps ([`pointwise`](crate::network::pointwise)), bilinear doublings ([`upsample`](crate::network::upsample)), and the state of the
 //! vector registers after products ([`vector_state`](crate::network::vector_state)).
 
 use std::sync::Arc;
@@ -12,6 +12,7 @@ use tract_onnx::tract_hir::infer::Factoid as _;
 
 use crate::error::{TrackError, TrackErrorKind};
 use crate::network::depthwise::replace_depthwise;
+use crate::network::pointwise::replace_pointwise;
 use crate::network::upsample::replace_doublings;
 use crate::network::vector_state::{clear_after_products, clear_upper_halves};
 
@@ -118,6 +119,9 @@ impl LoadedNet {
             .and_then(InferenceModelExt::into_typed)
             .and_then(TypedModel::into_decluttered)
             .and_then(|mut model| replace_depthwise(&mut model).map(|()| model))
+            // Leaves channels before rows and columns wherever it can.
+            .and_then(TypedModel::into_decluttered)
+            .and_then(|mut model| replace_pointwise(&mut model).map(|()| model))
             .map_err(|error| failed_load(name, &error))?;
         Ok(Self { model, shape, name: name.into() })
     }
