@@ -1,4 +1,4 @@
-//! What a fit asks of the model that it fits.
+//! Interface between a fit and the model that is fitted.
 
 use flyrig_renderer::HarmonicOrder;
 

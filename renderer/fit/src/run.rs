@@ -1,4 +1,4 @@
-//! Course of a fit: its number of steps, given or measured, and what is due between them.
+//! Course of a fit: its number of steps, given or measured, and the tasks that are due between them.
 
 use std::time::{Duration, Instant};
 
@@ -26,7 +26,7 @@ pub enum Length {
     Minutes(f64),
 }
 
-/// What is due after a step.
+/// Tasks that are due after a step.
 #[derive(Debug, Clone, Copy, PartialEq, Default)]
 pub struct Due {
     /// Mean PSNR of the images since it was shown last, decibels.

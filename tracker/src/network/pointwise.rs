@@ -97,7 +97,7 @@ impl Pointwise {
         }))
     }
 
-    /// Takes over what follows the product `id`; returns the last node whose result this operator gives, and the tensor that it adds.
+    /// Takes over the operators that follow the product `id`; returns the last node whose result this operator gives, and the tensor that it adds.
     fn take_followers(&mut self, model: &TypedModel, id: usize) -> TractResult<(usize, Option<OutletId>)> {
         let mut last = self.take_bias(model, id)?;
         last = self.clips[0].take(model, last)?;
@@ -150,7 +150,7 @@ fn channels_axis(axes: &AxesMapping, from: &[usize], to: &[usize]) -> Option<usi
     is_kept.then_some(channel)
 }
 
-/// Returns the only node that takes the output of `id`, if that adds, and what it adds.
+/// Returns the only node that takes the output of `id`, if that is an addition, with the other summand.
 fn addition(model: &TypedModel, id: usize) -> Option<(usize, OutletId)> {
     let next = only_successor(model, id)?;
     let node = model.node(next.node);
@@ -177,7 +177,7 @@ struct Mix<'a> {
     weights: &'a [f32],
     biases: &'a [f32],
     input: &'a [f32],
-    /// What is added to these planes, and to what follows them.
+    /// Values that are added to these planes and to those that follow them; `None` where nothing is added.
     added: Option<&'a [f32]>,
     output: &'a mut [f32],
 }
