@@ -176,6 +176,11 @@ impl BodyModel {
         (0.5 * (at(LEFT_SHOULDER) + at(RIGHT_SHOULDER)) - 0.5 * (at(LEFT_HIP) + at(RIGHT_HIP))).length()
     }
 
+    /// Whether a joint is beyond the wrist.
+    pub fn is_finger(&self, joint: usize) -> bool {
+        self.roles.hand.iter().any(|&hand| joint != hand && self.hangs_below(joint, hand))
+    }
+
     /// Whether a joint hangs below another or is it.
     pub fn hangs_below(&self, mut joint: usize, ancestor: usize) -> bool {
         // Parents come before their children.

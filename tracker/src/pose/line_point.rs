@@ -94,6 +94,13 @@ pub(crate) fn bones(model: &BodyModel, template: &Template, vertex: usize) -> Ve
         .collect()
 }
 
+/// Whether a fit of the body may use a point with these bones. Points on fingers are left out: fingers do not turn in that
+/// fit, so wrist and arm would turn to match them.
+pub(crate) fn is_usable(model: &BodyModel, bones: &[(usize, f64, DVec3)]) -> bool {
+    let of_fingers: f64 = bones.iter().filter(|(joint, ..)| model.is_finger(*joint)).map(|(_, weight, _)| weight).sum();
+    !bones.is_empty() && of_fingers <= 0.5
+}
+
 /// Returns normal and offset on the undistorted plane of the line through a pixel with a normal in the image.
 pub(crate) fn undistorted_line(camera: &Camera, view: &View, through: DVec2, normal: DVec2) -> Option<(DVec2, f64)> {
     let (on, beyond) = (view.undistorted(camera, through)?, view.undistorted(camera, through + normal)?);
@@ -107,6 +114,22 @@ mod tests {
 
     use super::*;
     use crate::testing::body;
+
+    #[test]
+    fn points_of_the_palm_are_usable_and_those_of_fingers_are_not() {
+        let fingered = body().with_fingers().unwrap();
+        let model = BodyModel::new(&fingered).unwrap();
+        let usable = |vertex: usize| is_usable(&model, &bones(&model, &fingered, vertex));
+        let (tip, _) = (fingered.positions.iter().enumerate()).max_by(|a, b| a.1.x.total_cmp(&b.1.x)).unwrap();
+        assert!(!usable(tip), "a fingertip");
+        let of_hands: Vec<usize> = (0..fingered.positions.len())
+            .filter(|&v| bones(&model, &fingered, v).iter().any(|(joint, w, _)| model.roles.hand.contains(joint) && *w > 0.9))
+            .collect();
+        assert!(of_hands.len() > 20 && of_hands.into_iter().all(usable), "palms");
+        let rest = (0..fingered.positions.len()).filter(|&v| usable(v)).count();
+        assert!(rest > fingered.positions.len() / 2 && rest < fingered.positions.len(), "{rest}");
+        assert!(!is_usable(&model, &[]), "no bone");
+    }
 
     #[test]
     fn a_point_of_a_shoe_hangs_on_the_foot_as_far_outside_as_it_is() {

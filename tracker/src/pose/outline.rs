@@ -10,7 +10,7 @@ use glam::{DVec2, DVec3, Vec3};
 use crate::image::view::View;
 use crate::masks::gate::{BodyGate, drawn_body};
 use crate::pose::body_model::BodyModel;
-use crate::pose::line_point::{LineKind, LinePoint, bones, undistorted_line};
+use crate::pose::line_point::{LineKind, LinePoint, bones, is_usable, undistorted_line};
 
 /// Largest sine of the angle between a rim vertex's normal and the image plane.
 const RIM_SINE: f64 = 0.4;
@@ -83,7 +83,7 @@ impl SeenBody<'_> {
             let end = mask_end(mask, at, direction, reach_m * px_per_m)?;
             let (normal, offset) = undistorted_line(self.camera, self.view, end, direction)?;
             let bones = bones(self.model, self.template, vertex);
-            (!bones.is_empty()).then_some(LinePoint {
+            is_usable(self.model, &bones).then_some(LinePoint {
                 kind: LineKind::Outline,
                 vertex,
                 worn: DVec3::ZERO,

@@ -12,7 +12,7 @@ use crate::image::grid::Grid;
 use crate::image::pixels::Rgb;
 use crate::image::view::View;
 use crate::pose::body_model::BodyModel;
-use crate::pose::line_point::{LineKind, LinePoint, bones, undistorted_line};
+use crate::pose::line_point::{LineKind, LinePoint, bones, is_usable, undistorted_line};
 
 /// Distance between neighbouring points on the rest surface, metres.
 const SPACING_M: f64 = 0.03;
@@ -192,7 +192,7 @@ impl Texture {
             };
             let vertex = self.points[index];
             let bones = bones(model, template, vertex);
-            if !bones.is_empty() {
+            if is_usable(model, &bones) {
                 let kind = LineKind::Texture;
                 lines.push(LinePoint {
                     kind,
