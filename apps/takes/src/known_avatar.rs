@@ -1,9 +1,11 @@
 //! Persons who are known before the first image, from `body.avatar`.
 
+use std::sync::Arc;
+
 use anyhow::{Context as _, Result};
 use flyrig_avatar::{Avatar, AvatarError};
 use flyrig_body::Template;
-use flyrig_fusion::{BodySettings, PersonMemory, person_gaussians};
+use flyrig_fusion::{BodySettings, PersonMemory};
 
 use crate::avatar_stream::encode_avatar;
 
@@ -24,8 +26,8 @@ impl From<Template> for KnownBody {
 
 /// Loads the avatar that the settings name as the known first person; `None` if no avatar is named.
 ///
-/// The body has the mean shape of clothes and hair, and the avatar's colours lie on the Gaussians that a session samples there. With
-/// `for_viewers`, the stream carries the avatar itself, so that viewers render it.
+/// The person is made of the avatar's Gaussians. With `for_viewers`, the stream carries the avatar itself, so that viewers render it from
+/// poses alone.
 ///
 /// # Errors
 /// Names the file and the fix in one line.
@@ -37,11 +39,11 @@ pub fn known_body(body: &BodySettings, for_viewers: bool) -> Result<Option<Known
         }
         other => other.context("body.avatar")?,
     };
-    let template = avatar.surface();
-    let surface = person_gaussians(&template, body).context("body.avatar")?;
-    let mut memory = PersonMemory::of_colors(&template, &avatar.surface_colors(&surface));
-    if for_viewers {
-        memory = memory.with_stream(encode_avatar(&avatar).context("body.avatar")?);
+    let template = avatar.template.clone();
+    let stream = for_viewers.then(|| encode_avatar(&avatar)).transpose().context("body.avatar")?;
+    let mut memory = PersonMemory::of_avatar(Arc::new(avatar));
+    if let Some(stream) = stream {
+        memory = memory.with_stream(stream);
     }
     Ok(Some(KnownBody { template, memory: Some(memory) }))
 }

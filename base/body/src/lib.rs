@@ -87,6 +87,6 @@ pub use shoes::Shoes;
 pub use skeleton::{Joint, Skeleton};
 pub use skinning::{skin_jacobian_f64, skin_mesh, skin_normal_f64, skin_point_f64};
 pub use skirt::Skirt;
-pub use surface::{DEFAULT_GAUSSIAN_COUNT, SurfaceGaussians, sample_surface};
+pub use surface::{DEFAULT_GAUSSIAN_COUNT, SurfaceGaussians, attached_surface, sample_surface};
 pub use template::{Part, SkinWeights, Template};
 pub use vertex_means::VertexMeans;

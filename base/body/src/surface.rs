@@ -100,30 +100,59 @@ pub fn sample_surface(template: &Template, count: usize, seed: u64) -> Result<Su
             (triangle as u32, [1.0 - v - w, v, w])
         })
         .collect();
-    let blend = |list: &[Vec3], (triangle, weights): (u32, [f32; 3])| -> Vec3 {
-        template.triangles[triangle as usize].iter().zip(weights).map(|(&i, w)| list[i as usize] * w).sum()
-    };
-    let normal = |candidate: (u32, [f32; 3])| {
-        let [a, b, c] = corners(template, &template.triangles[candidate.0 as usize]);
-        blend(&template.normals, candidate).try_normalize().unwrap_or((b - a).cross(c - a).normalize_or(Vec3::Y))
-    };
-    let position = |candidate: (u32, [f32; 3])| blend(&template.positions, candidate);
+    let position = |candidate: (u32, [f32; 3])| blend(template, &template.positions, candidate);
     let kept = eliminate(
         candidates.iter().map(|&c| position(c)).collect(),
-        candidates.iter().map(|&c| normal(c)).collect(),
+        candidates.iter().map(|&c| normal_at(template, c)).collect(),
         count,
         area,
     );
     let candidates: Vec<(u32, [f32; 3])> = kept.iter().map(|&i| candidates[i]).collect();
     drop(kept);
 
-    let positions: Vec<Vec3> = candidates.iter().map(|&c| position(c)).collect();
-    let normals: Vec<Vec3> = candidates.iter().map(|&c| normal(c)).collect();
-    let scale_m = scales(&positions, &normals, (area / count as f64).sqrt() as f32);
+    let positions = candidates.iter().map(|&c| position(c)).collect();
+    let skin = candidates.iter().map(|&c| blend_skin(template, c)).collect();
+    Ok(described(template, &candidates, positions, skin))
+}
+
+/// Describes Gaussians that are attached to points of a template's surface (triangle and weights of its corners) and lie near
+/// them. Scales fit their spacing.
+///
+/// # Errors
+/// [`BodyError::Mesh`] when the template is not valid, there are no Gaussians, the lists differ in length, or an attachment is
+/// not the template's.
+pub fn attached_surface(
+    template: &Template,
+    attachments: &[(u32, [f32; 3])],
+    positions: Vec<Vec3>,
+    skin: Vec<SkinWeights>,
+) -> Result<SurfaceGaussians, BodyError> {
+    template.check()?;
+    let count = attachments.len();
+    let triangles = template.triangles.len();
+    if count == 0
+        || [positions.len(), skin.len()] != [count; 2]
+        || attachments.iter().any(|(triangle, _)| *triangle as usize >= triangles)
+    {
+        let message = format!("{} Gaussians and {count} attachments to {triangles} triangles", positions.len());
+        return Err(BodyError::Mesh { name: template.name.clone(), message });
+    }
+    Ok(described(template, attachments, positions, skin))
+}
+
+/// Returns all attributes of attached Gaussians.
+fn described(
+    template: &Template,
+    attachments: &[(u32, [f32; 3])],
+    positions: Vec<Vec3>,
+    skin: Vec<SkinWeights>,
+) -> SurfaceGaussians {
+    let normals: Vec<Vec3> = attachments.iter().map(|&attachment| normal_at(template, attachment)).collect();
+    let spacing = (template.area_m2() / attachments.len() as f64).sqrt() as f32;
+    let scale_m = scales(&positions, &normals, spacing);
     let part_of_joint = part_of_joints(&template.skeleton);
-    let skin: Vec<SkinWeights> = candidates.iter().map(|&c| blend_skin(template, c)).collect();
-    Ok(SurfaceGaussians {
-        uvs: candidates
+    SurfaceGaussians {
+        uvs: attachments
             .iter()
             .map(|&(triangle, weights)| {
                 let corners = template.triangles[triangle as usize];
@@ -133,12 +162,24 @@ pub fn sample_surface(template: &Template, count: usize, seed: u64) -> Result<Su
         parts: skin.iter().map(|s| part_of_joint[usize::from(s.joints[0])]).collect(),
         skin,
         scale_m,
-        depth_m: vec![0.0; candidates.len()],
-        triangle: candidates.iter().map(|c| c.0).collect(),
-        barycentric: candidates.iter().map(|c| c.1).collect(),
+        depth_m: vec![0.0; attachments.len()],
+        triangle: attachments.iter().map(|a| a.0).collect(),
+        barycentric: attachments.iter().map(|a| a.1).collect(),
         positions,
         normals,
-    })
+    }
+}
+
+/// Interpolates values of the template's vertices.
+fn blend(template: &Template, list: &[Vec3], (triangle, weights): (u32, [f32; 3])) -> Vec3 {
+    template.triangles[triangle as usize].iter().zip(weights).map(|(&i, w)| list[i as usize] * w).sum()
+}
+
+/// Returns the unit normal of the surface at an attachment.
+fn normal_at(template: &Template, attachment: (u32, [f32; 3])) -> Vec3 {
+    let [a, b, c] = corners(template, &template.triangles[attachment.0 as usize]);
+    let normal = blend(template, &template.normals, attachment);
+    normal.try_normalize().unwrap_or((b - a).cross(c - a).normalize_or(Vec3::Y))
 }
 
 /// Returns the standard deviations of Gaussians that are about `spacing` apart, metres.

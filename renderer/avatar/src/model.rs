@@ -11,3 +11,4 @@ pub(crate) mod posing;
 pub(crate) mod scene;
 pub(crate) mod splat_glb;
 mod surface;
+mod tracking;

@@ -5,5 +5,7 @@
 
 pub(crate) mod buffers;
 pub(crate) mod harmonics;
+pub(crate) mod join;
 pub(crate) mod order;
+pub(crate) mod recolor;
 pub(crate) mod splats;

@@ -30,8 +30,10 @@ mod splats;
 mod view_bytes;
 mod view_painter;
 
-pub use anisotropic::buffers::{AnisotropicBuffers, AnisotropicGradients, Gaussians};
+pub use anisotropic::buffers::{AnisotropicBuffers, AnisotropicGradients, Gaussians, SurfaceBuffers};
+pub use anisotropic::join::GaussianJoin;
 pub use anisotropic::order::HarmonicOrder;
+pub use anisotropic::recolor::{Corrected, Recolor};
 pub use anisotropic::splats::AnisotropicSplats;
 pub use appearance::color_means::ColorMeans;
 pub use appearance::hierarchy::{DiffusionHierarchy, DiffusionLevel};
@@ -48,7 +50,7 @@ pub use files::anisotropic_ply::{PlyError, parse_anisotropic_ply, write_anisotro
 pub use files::ply::{ExportError, SH_DEGREE_0};
 pub use image_loss::loss::{ImageLoss, ImageSums, WantedImage};
 pub use image_loss::settings::{LossSettings, UNKNOWN_RGBA};
-pub use raster::kernels::BACKFACING_COSINE;
+pub use raster::kernels::{AWAY_COSINE, BACKFACING_COSINE};
 pub use raster::rasterizer::Rasterizer;
 pub use raster::settings::{Outputs, RasterSettings, RasterStats};
 pub use schema::{ANISOTROPIC_ATTRIBUTES, GAUSSIAN_ATTRIBUTES, GaussianAttribute, GaussianElement, PLY_PROPERTIES};

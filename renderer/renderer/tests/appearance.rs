@@ -120,6 +120,37 @@ fn agrees_with_the_reference_over_time_in_every_setting() {
 }
 
 #[test]
+fn corrections_agree_with_the_reference_and_are_nothing_where_nobody_looks() {
+    on_both(|gpu| {
+        let frames: Vec<_> = {
+            let person = scene::person(4000, 150);
+            [0.0, 0.6, 1.2].map(|turn| scene::frame(&person, turn)).into()
+        };
+        let pictures: Vec<_> = frames.iter().map(|frame| views(frame, 96)).collect();
+        for settings in ablations().map(|settings| AppearanceSettings { corrects: true, ..settings }) {
+            let mut rig = Rig::new(gpu, 4000, 150);
+            let mut state = reference::State { memory: vec![DVec4::ZERO; 4000], last: None };
+            let nothing = rig.update(&frames[0], &[], &settings);
+            assert!(nothing.iter().all(|color| color[..3].iter().all(|value| value.abs() <= 0.0)), "{settings:?}");
+            for (frame, seen) in [(0, 0..3), (1, 1..3), (2, 0..0), (2, 2..3)] {
+                let (frame, views) = (&frames[frame], &pictures[frame][seen]);
+                let ours = rig.update(frame, views, &settings);
+                let expected = rig.reference(frame, views, &settings, &mut state);
+                let (worst, mean) = difference(&ours, &expected);
+                println!("{settings:?} {} views: max {worst:.2e}, mean {mean:.2e}", views.len());
+                let most = if settings.space { TOLERANCE } else { BASELINE_TOLERANCE };
+                assert!(mean < MEAN_TOLERANCE && worst < most, "{settings:?}: {worst}, mean {mean}");
+            }
+            assert!(ours_of(&rig).iter().any(|color| color[..3].iter().any(|c| *c < -0.01)), "some are negative");
+        }
+    });
+}
+
+fn ours_of(rig: &Rig) -> Vec<[f32; 4]> {
+    rig.buffers.color.read(&rig.gpu).unwrap()
+}
+
+#[test]
 fn the_same_input_gives_the_same_bytes() {
     on_both(|gpu| {
         let mut rig = Rig::new(gpu, 4000, 150);

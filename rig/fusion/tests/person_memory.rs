@@ -3,11 +3,23 @@
 
 mod support;
 
+use std::sync::Arc;
+
+use flyrig_avatar::Avatar;
+use flyrig_body::{DEFAULT_SIGMA2_M2, build_graph, sample_surface};
 use flyrig_fusion::{AppearanceMode, PersonId, PersonMemory, Session, SessionBuilder, TrackState};
 
+use flyrig_renderer::HarmonicOrder;
 use support::{frame_set, gpu, images, people, rig, session, settings, template};
 
 const ME: PersonId = PersonId(0);
+
+/// Creates an avatar of one colour.
+fn avatar(color: [f32; 3]) -> Avatar {
+    let surface = sample_surface(&template(), 3000, 1).unwrap();
+    let graph = build_graph(&template(), &surface, 60, DEFAULT_SIGMA2_M2).unwrap();
+    Avatar::new(&template(), &surface, Some(&graph), &vec![color; 3000], HarmonicOrder::One).unwrap()
+}
 
 fn colors(session: &Session) -> Vec<[f32; 3]> {
     session.splats(ME).unwrap().iter().map(|splat| splat.color).collect()
@@ -42,9 +54,9 @@ fn a_session_resumes_a_saved_person_and_refuses_one_that_does_not_fit() {
 }
 
 #[test]
-fn colors_known_beforehand_stay_where_nobody_looks_yield_to_images_and_return_after_an_absence() {
-    // Blue all around; the only camera that delivers stands in front and sees green.
-    let known = PersonMemory::of_colors(&template(), &vec![[0.02, 0.04, 0.6]; 3000]);
+fn an_avatar_takes_the_colours_of_images_and_returns_after_an_absence() {
+    // Blue; the only camera that delivers stands in front and sees green.
+    let known = PersonMemory::of_avatar(Arc::new(avatar([0.02, 0.04, 0.6])));
     let builder = SessionBuilder::new(gpu(), rig()).settings(settings(3000));
     let mut session = builder.perception(people(&rig(), &[(0, 0.0)]).dressed()).person(ME, known).build().unwrap();
     let images = images(&[(0.0, [30, 160, 60])]);
@@ -54,29 +66,22 @@ fn colors_known_beforehand_stay_where_nobody_looks_yield_to_images_and_return_af
         set
     };
     let count = |session: &Session, is: fn(&[f32; 3]) -> bool| colors(session).iter().filter(|color| is(color)).count();
-    let (blue, green) = (|c: &[f32; 3]| c[2] > 3.0 * c[1], |c: &[f32; 3]| c[1] > c[2]);
+    let (blue, green) = (|c: &[f32; 3]| c[2] > 3.0 * c[1], |c: &[f32; 3]| c[1] > c[2].max(c[0]));
     assert_eq!(count(&session, blue), 3000, "before any image");
     for index in 0..10 {
         session.process(&front(index)).unwrap();
     }
-    let (unseen, seen) = (count(&session, blue), count(&session, green));
-    assert!(unseen > 1000 && seen > 500, "{unseen} blue, {seen} green");
-    // No person is there for two seconds, and the one who comes back starts from blue again.
+    let seen = count(&session, green);
+    assert!(seen > 1000, "{seen} green");
+    // No person is there for two seconds. Nothing is left of the green when another camera sees red.
     let mut nobody = images.clone();
     nobody.iter_mut().for_each(|(_, mask)| mask.fill(0));
     session.process(&frame_set(10, &nobody)).unwrap();
-    let mut back = frame_set(71, &images);
+    let mut back = frame_set(71, &support::images(&[(0.0, [170, 30, 40])]));
     back.frames[..3].fill(None);
     session.process(&back).unwrap();
-    let (before, [unseen, seen]) = (unseen, [count(&session, blue), count(&session, green)]);
-    assert!(unseen > 1000 && seen > 100, "{unseen} blue ({before} before), {seen} green");
+    assert!(count(&session, green) < 30, "{} of {seen} green", count(&session, green));
     assert_eq!(session.subjects()[0].watch().state(), TrackState::First);
-
-    let poisoned = PersonMemory::of_colors(&template(), &vec![[f32::NAN, f32::INFINITY, 0.5]; 3000]);
-    let builder = SessionBuilder::new(gpu(), rig()).settings(settings(3000));
-    let mut session = builder.perception(people(&rig(), &[(0, 0.0)]).dressed()).person(ME, poisoned).build().unwrap();
-    session.process(&front(0)).unwrap();
-    assert!(colors(&session).iter().flatten().all(|value| value.is_finite()));
 }
 
 #[test]

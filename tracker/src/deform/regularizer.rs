@@ -15,6 +15,8 @@ pub(super) struct Regularizer {
     pub temporal: f64,
     /// Weight of every node's squared distance from the place of its pose.
     pub anchor: f64,
+    /// Translations of the nodes in the mean shape, canonical metres, from which spatial smoothness and the anchor are measured.
+    pub mean: Vec<DVec3>,
     /// Whether there were frame sets before this one; the temporal term is off without.
     pub history: bool,
 }
@@ -30,7 +32,7 @@ impl Regularizer {
     }
 
     /// Returns the loss at translations `t` with smoothed translations `smooth`, and adds its gradient to `gradient`.
-    /// Spatial smoothness and the anchor are measured from `thickness`.
+    /// Spatial smoothness and the anchor are measured from the mean shape and `thickness` beyond it.
     pub(super) fn loss(
         &self,
         t: &[DVec3],
@@ -38,7 +40,7 @@ impl Regularizer {
         thickness: Option<&Thickness>,
         mut gradient: Option<&mut [DVec3]>,
     ) -> f64 {
-        let offset = |node: usize| thickness.map_or(DVec3::ZERO, |thickness| thickness.offset(node));
+        let offset = |node: usize| self.mean[node] + thickness.map_or(DVec3::ZERO, |thickness| thickness.offset(node));
         let (mut loss, temporal) = (0.0, self.temporal());
         if self.anchor > 0.0 {
             let off = |(node, t): (usize, &DVec3)| *t - offset(node);

@@ -39,13 +39,13 @@ impl Thickness {
         self.normals[node] * known[self.parts[node]]
     }
 
-    /// Learns from the result of a frame set; a node's weight is the information of the images along its normal, `n^T H n`.
-    pub(super) fn learn(&mut self, translations: &[DVec3], matrix: &NormalMatrix) {
+    /// Learns from the result of a frame set: translations beyond `mean`. A node's weight is the information of the images along its normal, `n^T H n`.
+    pub(super) fn learn(&mut self, translations: &[DVec3], mean: &[DVec3], matrix: &NormalMatrix) {
         let count = self.parts.iter().max().map_or(0, |most| most + 1);
         let mut sums = vec![(0.0, 0.0); count];
-        for (node, (t, normal)) in translations.iter().zip(&self.normals).enumerate() {
+        for (node, ((t, mean), normal)) in translations.iter().zip(mean).zip(&self.normals).enumerate() {
             let weight = normal.dot(matrix.diagonal_block(node) * *normal);
-            let along = t.dot(*normal).clamp(self.range_m[0], self.range_m[1]);
+            let along = (*t - *mean).dot(*normal).clamp(self.range_m[0], self.range_m[1]);
             if weight.is_finite() && weight > 0.0 && along.is_finite() {
                 let (weights, sum) = &mut sums[self.parts[node]];
                 *weights += weight;

@@ -98,6 +98,7 @@ impl DeformTracker {
             spatial: settings.regularization * settings.spatial,
             temporal: settings.regularization * settings.temporal,
             anchor: settings.anchor,
+            mean: vec![DVec3::ZERO; nodes],
             history: false,
         };
         Ok(Self {
@@ -157,11 +158,22 @@ impl DeformTracker {
         Ok(self)
     }
 
-    /// Resets to rest; the next frame set counts as the first.
+    /// Starts from a known mean shape: translations of the nodes, canonical metres. Smoothness and thickness are measured from
+    /// it, and [`Self::reset`] returns to it.
+    ///
+    /// # Errors
+    /// [`TrackErrorKind::Template`] unless there is one finite translation per node.
+    pub fn with_mean(mut self, translations: &[DVec3]) -> Result<Self, TrackError> {
+        self.check_translations(translations)?;
+        self.regularizer.mean = translations.to_vec();
+        self.reset();
+        Ok(self)
+    }
+
+    /// Resets to the mean shape; the next frame set counts as the first.
     pub fn reset(&mut self) {
-        self.translations.fill(DVec3::ZERO);
-        self.smooth.fill(DVec3::ZERO);
-        self.displacement.fill([0.0; 4]);
+        self.restore(self.regularizer.mean.clone());
+        self.smooth.clone_from(&self.translations);
         if let Some(thickness) = &mut self.thickness {
             thickness.forget();
         }
@@ -184,14 +196,19 @@ impl DeformTracker {
     /// # Errors
     /// [`TrackErrorKind::Template`] unless there is one finite translation per node.
     pub fn resume(&mut self, translations: &[DVec3]) -> Result<(), TrackError> {
+        self.check_translations(translations)?;
+        self.reset();
+        self.restore(translations.to_vec());
+        self.smooth.clone_from(&self.translations);
+        Ok(())
+    }
+
+    fn check_translations(&self, translations: &[DVec3]) -> Result<(), TrackError> {
         let nodes = self.translations.len();
         if translations.len() != nodes || !translations.iter().all(|t| t.is_finite()) {
             let message = format!("{} finite translations for {nodes} nodes of the graph", translations.len());
             return Err(TrackError::new(TrackErrorKind::Template, message));
         }
-        self.reset();
-        self.restore(translations.to_vec());
-        self.smooth.clone_from(&self.translations);
         Ok(())
     }
 
@@ -269,7 +286,7 @@ impl DeformTracker {
             *smooth += (*t - *smooth) * share;
         }
         if let Some(thickness) = &mut self.thickness {
-            thickness.learn(&self.translations, &self.matrix);
+            thickness.learn(&self.translations, &self.regularizer.mean, &self.matrix);
         }
         self.frame += 1;
         Ok(report)

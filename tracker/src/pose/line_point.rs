@@ -122,10 +122,12 @@ mod tests {
         let usable = |vertex: usize| is_usable(&model, &bones(&model, &fingered, vertex));
         let (tip, _) = (fingered.positions.iter().enumerate()).max_by(|a, b| a.1.x.total_cmp(&b.1.x)).unwrap();
         assert!(!usable(tip), "a fingertip");
-        let of_hands: Vec<usize> = (0..fingered.positions.len())
-            .filter(|&v| bones(&model, &fingered, v).iter().any(|(joint, w, _)| model.roles.hand.contains(joint) && *w > 0.9))
-            .collect();
-        assert!(of_hands.len() > 20 && of_hands.into_iter().all(usable), "palms");
+        let is_palm = |&v: &usize| {
+            let bones = bones(&model, &fingered, v);
+            bones.iter().any(|(joint, weight, _)| model.roles.hand.contains(joint) && *weight > 0.6)
+        };
+        let palms: Vec<usize> = (0..fingered.positions.len()).filter(is_palm).collect();
+        assert!(palms.len() > 5 && palms.iter().all(|v| usable(*v)), "{} points of palms", palms.len());
         let rest = (0..fingered.positions.len()).filter(|&v| usable(v)).count();
         assert!(rest > fingered.positions.len() / 2 && rest < fingered.positions.len(), "{rest}");
         assert!(!is_usable(&model, &[]), "no bone");

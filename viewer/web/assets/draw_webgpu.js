@@ -211,7 +211,8 @@ export class WebGpuDrawing {
     const frame = this.frame = constant(new Uint8Array(this.offsets.bytes));
     const { centers, normals, colors, splats, rects, pairsBefore, pairTotal, work } = own;
     const projected = { 0: frame, 1: centers, 5: splats, 6: rects, 7: own.depthElements };
-    if (this.hasAxes) step("projectAxes", { ...projected, 2: own.scales, 3: own.rotations }, groupsFor(count, 64));
+    // The page hides what faces away by its opacity; normals are bound and not read.
+    if (this.hasAxes) step("projectAxes", { ...projected, 2: own.scales, 3: own.rotations, 4: centers }, groupsFor(count, 64));
     // No canonical positions are drawn; something must be bound.
     else step("project", { ...projected, 2: normals, 3: colors, 4: normals }, groupsFor(count, 64));
     const depthLength = constant(new Uint32Array([tableLength(count), 0, 0, 0]));
@@ -252,7 +253,7 @@ export class WebGpuDrawing {
     words(offsets.size, [width, height]);
     words(offsets.tiles, this.tiles);
     words(offsets.gaussians, [this.count]);
-    words(offsets.cullBackfacing, [1]);
+    words(offsets.cullBackfacing, [this.hasAxes ? 0 : 1]);
     words(offsets.pairCapacity, [this.pairs]);
     floats(offsets.near, [numbers.nearM]);
     floats(offsets.filterVariance, [numbers.filterVariancePx2]);

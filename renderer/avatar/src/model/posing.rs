@@ -207,6 +207,12 @@ impl PosedAvatar {
         avatar.light.backward(normal, harmonics, slopes, avatar.parameters.order().coefficients())
     }
 
+    /// Returns the world unit normal of the surface at each Gaussian.
+    #[must_use]
+    pub fn normals(&self) -> impl ExactSizeIterator<Item = Vec3> {
+        self.places.iter().map(|place| place.normal)
+    }
+
     /// Returns the canonical position of each posed Gaussian, including deformation and offset, metres.
     pub(crate) fn canonical(&self) -> impl ExactSizeIterator<Item = Vec3> {
         self.places.iter().map(|place| place.canonical)

@@ -24,7 +24,19 @@ pub struct AnisotropicBuffers {
     pub rotation: StorageBuffer<GaussianElement>,
     /// Coefficients of linear RGB; w unused. Those of one Gaussian are consecutive.
     pub harmonics: StorageBuffer<GaussianElement>,
+    /// Surface that the Gaussians belong to; `None` for free ones.
+    pub surface: Option<SurfaceBuffers>,
     order: HarmonicOrder,
+}
+
+/// Surface that anisotropic Gaussians belong to, one element per Gaussian. Gaussians whose surface faces away from the camera
+/// ([`AWAY_COSINE`](crate::AWAY_COSINE)) are culled, and canonical positions can be rendered.
+#[derive(Debug)]
+pub struct SurfaceBuffers {
+    /// World unit normal of the surface; w unused.
+    pub normal: StorageBuffer<GaussianElement>,
+    /// Canonical position, metres, finite; w unused.
+    pub canonical: StorageBuffer<GaussianElement>,
 }
 
 impl AnisotropicBuffers {
@@ -38,8 +50,19 @@ impl AnisotropicBuffers {
             scale_opacity: schema::SCALE_OPACITY.zeroed(gpu, count)?,
             rotation: schema::ROTATION.zeroed(gpu, count)?,
             harmonics: schema::HARMONICS.zeroed(gpu, count * order.coefficients())?,
+            surface: None,
             order,
         })
+    }
+
+    /// Adds a surface, all zero.
+    ///
+    /// # Errors
+    /// [`GpuError::TooLarge`].
+    pub fn with_surface(self, gpu: &GpuContext) -> Result<Self, GpuError> {
+        let (normal, canonical) =
+            (schema::NORMAL.zeroed(gpu, self.count())?, schema::CANONICAL.zeroed(gpu, self.count())?);
+        Ok(Self { surface: Some(SurfaceBuffers { normal, canonical }), ..self })
     }
 
     /// Returns the number of Gaussians.
@@ -103,8 +126,8 @@ impl AnisotropicGradients {
 pub enum Gaussians<'a> {
     /// Surface Gaussians of one scale and one colour each.
     Isotropic(&'a GaussianBuffers),
-    /// Gaussians of three scales and colours by direction. They have neither normals nor canonical positions: none is
-    /// culled, and [`RenderTarget::canonical`](crate::RenderTarget::canonical) keeps its content.
+    /// Gaussians of three scales and colours by direction. Without a [`SurfaceBuffers`] none is culled, and
+    /// [`RenderTarget::canonical`](crate::RenderTarget::canonical) keeps its content.
     Anisotropic(&'a AnisotropicBuffers),
 }
 
@@ -115,6 +138,16 @@ impl Gaussians<'_> {
         match self {
             Self::Isotropic(gaussians) => gaussians.count(),
             Self::Anisotropic(gaussians) => gaussians.count(),
+        }
+    }
+
+    /// Returns the normals and canonical positions of the surface; `None` without one.
+    pub(crate) fn surface(&self) -> Option<(&StorageBuffer<GaussianElement>, &StorageBuffer<GaussianElement>)> {
+        match self {
+            Self::Isotropic(gaussians) => Some((&gaussians.normal, &gaussians.canonical)),
+            Self::Anisotropic(gaussians) => {
+                gaussians.surface.as_ref().map(|surface| (&surface.normal, &surface.canonical))
+            }
         }
     }
 

@@ -11,6 +11,10 @@ struct Settings {
     time: u32,
     // 0 where there are no last colours.
     sharpness: f32,
+    // Whether colours are corrections of colours known before.
+    corrects: u32,
+    // Every channel of what nobody saw.
+    unseen: f32,
 }
 
 // By its bits: compilers may assume that no NaN exists and drop `x != x`.

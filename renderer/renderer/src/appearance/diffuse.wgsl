@@ -55,9 +55,8 @@ fn main(@builtin(local_invocation_index) lane: u32) {
     }
     let root = levels[top].x;
     if lane == 0u {
-        // Nobody saw anything: grey.
         let mean = node_seen[root];
-        node_color[root] = select(vec4(vec3(MID_GREY), 1.0), mean, mean.w > 0.0);
+        node_color[root] = select(vec4(vec3(settings.unseen), 1.0), mean, mean.w > 0.0);
     }
     storageBarrier();
     for (var below = top; below > 0u; below -= 1u) {

@@ -22,7 +22,7 @@ pub(super) const MIN_COVERAGE: f32 = 0.01;
 /// Extra weight of every view in the baseline: far below the weight of a visible view, far above rounding.
 const BASELINE_VIEW_WEIGHT: f32 = 1e-3;
 
-/// Layout of `struct Settings` in the WGSL (std430, 36 bytes).
+/// Layout of `struct Settings` in the WGSL (std430, 44 bytes).
 #[repr(C)]
 #[derive(Debug, Clone, Copy, Pod, Zeroable)]
 pub(super) struct SettingsConstants {
@@ -35,6 +35,8 @@ pub(super) struct SettingsConstants {
     pub space: u32,
     pub time: u32,
     pub sharpness: f32,
+    pub corrects: u32,
+    pub unseen: f32,
 }
 
 impl SettingsConstants {
@@ -46,10 +48,12 @@ impl SettingsConstants {
             min_mask: settings.min_mask,
             inpaint_weight: settings.inpaint_weight,
             smoothness: settings.smoothness,
-            view_weight: if settings.space { 0.0 } else { BASELINE_VIEW_WEIGHT },
+            view_weight: if settings.space || settings.corrects { 0.0 } else { BASELINE_VIEW_WEIGHT },
             space: settings.space.into(),
             time: settings.time.into(),
-            sharpness: if painted && settings.time { settings.sharpness } else { 0.0 },
+            sharpness: if settings.corrects || painted && settings.time { settings.sharpness } else { 0.0 },
+            corrects: settings.corrects.into(),
+            unseen: if settings.corrects { 0.0 } else { linear_from_srgb(0.5) },
         }
     }
 }
@@ -74,9 +78,8 @@ impl AppearanceKernels {
 fn sources() -> [(&'static str, String); 4] {
     let constants = format!(
         "const WORKGROUP: u32 = {WORKGROUP}u;\nconst NEAR_M: f32 = {NEAR_M:?};\n\
-         const MIN_RENDERED_ALPHA: f32 = {MIN_RENDERED_ALPHA:?};\nconst MIN_COVERAGE: f32 = {MIN_COVERAGE:?};\nconst MID_GREY: f32 = {:?};\n\
+         const MIN_RENDERED_ALPHA: f32 = {MIN_RENDERED_ALPHA:?};\nconst MIN_COVERAGE: f32 = {MIN_COVERAGE:?};\n\
          const RELAX_STEPS: u32 = {}u;\nconst DAMPING: f32 = {:?};\n",
-        linear_from_srgb(0.5),
         DiffusionHierarchy::RELAX_STEPS,
         DiffusionHierarchy::DAMPING,
     );

@@ -38,6 +38,10 @@ fn angle_weight(normal: vec3<f32>, camera_to_point: vec3<f32>) -> f32 {
 
 // Adds what drawing takes away: a Gaussian's image is its colour mixed with its neighbours'.
 fn sharpened(color: vec3<f32>, last: vec3<f32>, shown: vec4<f32>) -> vec3<f32> {
+    if settings.corrects != 0u {
+        let corrected = settings.sharpness * (last + color - shown.rgb / shown.w);
+        return select(vec3(0.0), clamp(corrected, vec3(-1.0), vec3(1.0)), all_finite(vec4(corrected, 0.0)));
+    }
     if !(settings.sharpness > 0.0 && shown.w >= MIN_RENDERED_ALPHA) {
         return color;
     }

@@ -21,7 +21,7 @@ fn main(
     }
     let sum = seen[i];
     let visible = min(quality[i].x, 1.0);
-    var observed = vec3(MID_GREY);
+    var observed = vec3(settings.unseen);
     if sum.w > 0.0 {
         observed = sum.rgb / sum.w;
     }
@@ -39,6 +39,10 @@ fn main(
             around += weights[j] * node_color[nodes[j]].rgb;
         }
         // Eq. 9 with f_gcn = mix(around, observed, own).
+        if settings.corrects != 0u && settings.sharpness > 0.0 {
+            // The share that observations lack is that of the surface around: a change of light is corrected entirely.
+            observed += (1.0 / settings.sharpness - 1.0) * around;
+        }
         current = (1.0 - visible) * mix(around, observed, own) + visible * observed;
     }
     if settings.time != 0u {

@@ -10,7 +10,6 @@ use crate::appearance::hierarchy::DiffusionHierarchy;
 use crate::appearance::kernels::{MIN_COVERAGE, MIN_RENDERED_ALPHA, NEAR_M, SettingsConstants};
 use crate::appearance::settings::ViewInput;
 use crate::buffers::GaussianBuffers;
-use crate::color::linear_from_srgb;
 
 /// Gaussians per task.
 const CHUNK: usize = 2048;
@@ -155,6 +154,10 @@ impl View<'_> {
     #[inline]
     fn sharpened(&self, color: Vec3, last: Vec3, shown: Vec4) -> Vec3 {
         let sharpness = self.settings.sharpness;
+        if self.settings.corrects != 0 {
+            let corrected = sharpness * (last + color - shown.truncate() / shown.w);
+            return if corrected.is_finite() { corrected.clamp(Vec3::NEG_ONE, Vec3::ONE) } else { Vec3::ZERO };
+        }
         if !(sharpness > 0.0 && shown.w >= MIN_RENDERED_ALPHA) {
             return color;
         }
@@ -220,9 +223,8 @@ pub(super) fn diffuse(graph: &GraphBuffers, settings: &SettingsConstants) {
         }
     }
     let Some(root) = levels.last().map(|level| level[0] as usize) else { return };
-    let grey = linear_from_srgb(0.5);
-    // Nobody saw anything: grey.
-    node_color[root] = if node_seen[root][3] > 0.0 { node_seen[root] } else { [grey, grey, grey, 1.0] };
+    let [r, g, b] = [settings.unseen; 3];
+    node_color[root] = if node_seen[root][3] > 0.0 { node_seen[root] } else { [r, g, b, 1.0] };
     let mut source: Vec<[f32; 4]> = Vec::new();
     for level in levels.iter().rev().skip(1) {
         let nodes = level[0] as usize..(level[0] + level[1]) as usize;
@@ -265,12 +267,12 @@ pub(super) fn paint(
     else {
         return;
     };
-    let grey = Vec3::splat(linear_from_srgb(0.5));
+    let unseen = Vec3::splat(settings.unseen);
     let one = |(i, (memory, color)): (usize, (&mut [f32; 4], &mut [f32; 4]))| {
         let sum = Vec4::from(seen[i]);
         let [weight, nearness] = quality[i];
         let visible = weight.min(1.0);
-        let observed = if sum.w > 0.0 { sum.truncate() / sum.w } else { grey };
+        let mut observed = if sum.w > 0.0 { sum.truncate() / sum.w } else { unseen };
         // What the paper's linear layer does with the two features it gets: a badly seen point follows the surface around it,
         // a seen one keeps its own detail.
         let own = visible / (visible + settings.inpaint_weight);
@@ -283,6 +285,10 @@ pub(super) fn paint(
                 .zip(&weights[i])
                 .map(|(&node, &weight)| weight * Vec4::from(node_color[node as usize]).truncate())
                 .sum();
+            if settings.corrects != 0 && settings.sharpness > 0.0 {
+                // The share that observations lack is that of the surface around: a change of light is corrected entirely.
+                observed += (1.0 / settings.sharpness - 1.0) * around;
+            }
             // Eq. 9 with f_gcn = mix(around, observed, own).
             let filled = around * (1.0 - own) + observed * own;
             current = (1.0 - visible) * filled + visible * observed;

@@ -60,6 +60,11 @@ pub struct AppearanceSettings {
     /// Share of the detail lost by rendering that is restored, 0 to 0.95; detail that rendering removes entirely is
     /// amplified `1 / (1 - sharpness)` times.
     pub sharpness: f32,
+    /// Whether the colours are corrections (linear RGB of any sign) of colours that are known before, as those of an avatar.
+    /// A view then observes the sum of the last correction and the difference between image and rendering: [`Self::sharpness`]
+    /// of each Gaussian's own, the rest of the surface around, so that detail which rendering removes does not grow. Where
+    /// nothing is observed there is no correction.
+    pub corrects: bool,
 }
 
 impl Default for AppearanceSettings {
@@ -73,6 +78,7 @@ impl Default for AppearanceSettings {
             inpaint_weight: 0.01,
             smoothness: 0.005,
             sharpness: 0.8,
+            corrects: false,
         }
     }
 }

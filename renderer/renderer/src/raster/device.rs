@@ -199,9 +199,11 @@ impl Stages<'_> {
             }
             Gaussians::Anisotropic(g) => {
                 let [center, scale, rotation, harmonics] = g.attributes().map(|a| a.raw().as_entire_binding());
-                let resources = [frame.clone(), center.clone(), scale, rotation, splats, rects, keyed.clone()];
-                let resources: Vec<_> = [0, 1, 2, 3, 5, 6, 7].into_iter().zip(resources).collect();
-                run_at(gpu, pass, r.kernels.project_anisotropic(gpu), &resources, groups);
+                // Bound, and not read, where there is no surface.
+                let normal = g.surface.as_ref().map_or(&g.center, |surface| &surface.normal).raw().as_entire_binding();
+                let (frame_, center_, keyed_) = (frame.clone(), center.clone(), keyed.clone());
+                let resources = [frame_, center_, scale, rotation, normal, splats, rects, keyed_];
+                run(gpu, pass, r.kernels.project_anisotropic(gpu), &resources, groups);
                 let resources = [frame, center, harmonics, keyed, r.painted.raw().as_entire_binding()];
                 run(gpu, pass, r.kernels.paint(gpu, g.order()), &resources, groups);
             }
@@ -254,8 +256,10 @@ impl Stages<'_> {
         let (r, p, t) = (self.rasterizer, self.picture, self.target);
         let (color, canonical) = match self.gaussians {
             Gaussians::Isotropic(g) => (&g.color, &g.canonical),
-            // No kernel that blends anisotropic Gaussians binds canonical positions.
-            Gaussians::Anisotropic(_) => (&r.painted, &r.painted),
+            // No kernel binds canonical positions where there is no surface.
+            Gaussians::Anisotropic(g) => {
+                (&r.painted, g.surface.as_ref().map_or(&r.painted, |surface| &surface.canonical))
+            }
         };
         let resources = [
             r.constants.get(FRAME),

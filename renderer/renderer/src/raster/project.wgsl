@@ -2,9 +2,10 @@
 // the rectangle of tiles it can reach, and its depth key.
 // Lines between "// only isotropic" or "// only anisotropic" and "// end" belong to Gaussians of that kind.
 // Prefix: camera.wgsl, raster/frame.wgsl, the attributes' bindings, anisotropic/axes.wgsl for anisotropic Gaussians, const TILE,
-// INVALID_KEY, CUT, BACKFACING_COSINE.
+// INVALID_KEY, CUT, BACKFACING_COSINE, AWAY_COSINE.
 @group(0) @binding(0) var<storage, read> frame: Frame;
-// Bindings 1 to 4: the attributes of the Gaussians (schema.rs), the first three of anisotropic ones.
+// Bindings 1 to 4: the attributes of the Gaussians (schema.rs); of anisotropic ones the first three and `normal`, whose elements
+// are read where Gaussians are culled.
 @group(0) @binding(5) var<storage, read_write> splats: array<Splat>;
 // First and last tile, each x | y << 16.
 @group(0) @binding(6) var<storage, read_write> rects: array<vec2<u32>>;
@@ -50,6 +51,13 @@ fn project(@builtin(workgroup_id) group: vec3<u32>, @builtin(num_workgroups) gro
     let is_finite = finite(vec4(world, 0.0)) && finite(scale_opacity[i]) && finite(rotation[i]);
     if !(is_finite && all(scale_m > vec3(0.0)) && own_opacity > 0.0 && is_rotation(rotation[i])) {
         return;
+    }
+    if frame.cull_backfacing != 0u {
+        let n = normal[i];
+        let sight = world - frame.camera.position.xyz;
+        if !finite(n) || dot(n.xyz, sight) > AWAY_COSINE * length(n.xyz) * length(sight) {
+            return;
+        }
     }
     // end
     let projected = project_point(frame.camera, world, frame.near_m);

@@ -28,8 +28,8 @@ impl Outputs {
 pub struct RasterSettings {
     /// Distance from the camera's plane below which centres are skipped, metres.
     pub near_m: f32,
-    /// Whether Gaussians whose normal points away from the camera are skipped ([`crate::BACKFACING_COSINE`]). For
-    /// closed surfaces.
+    /// Whether Gaussians whose normal points away from the camera are skipped ([`crate::BACKFACING_COSINE`],
+    /// [`crate::AWAY_COSINE`]). For closed surfaces.
     pub cull_backfacing: bool,
     /// Images to write.
     pub outputs: Outputs,
@@ -53,6 +53,7 @@ impl RasterSettings {
     pub(crate) fn for_kind(&self, gaussians: Gaussians<'_>) -> Self {
         match gaussians {
             Gaussians::Isotropic(_) => *self,
+            Gaussians::Anisotropic(gaussians) if gaussians.surface.is_some() => *self,
             Gaussians::Anisotropic(_) => {
                 let outputs = Outputs { canonical: false, ..self.outputs };
                 Self { cull_backfacing: false, outputs, ..*self }

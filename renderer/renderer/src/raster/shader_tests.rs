@@ -37,7 +37,9 @@ fn every_kernel_is_valid_wgsl_and_the_uniform_has_its_layout() {
     for order in HarmonicOrder::ALL {
         validate("paint", &paint_wgsl(order));
         validate("paint backward", &backward::paint_wgsl(order));
+        validate("recolor", &crate::anisotropic::recolor::recolor_wgsl(order));
     }
+    validate("join", crate::anisotropic::join::WGSL);
     validate("bins", &bins_wgsl());
     validate("places", &backward::places_wgsl());
     validate("sums", &backward::sums_wgsl());

@@ -35,10 +35,12 @@ pub fn update(
     settings: &AppearanceSettings,
     state: &mut State,
 ) -> Vec<DVec3> {
-    let last = |i: usize| state.last.as_ref().filter(|_| settings.time).map(|last| last[i]);
+    let none = settings.corrects.then_some(DVec3::ZERO);
+    let last =
+        |i: usize| state.last.as_ref().filter(|_| settings.time || settings.corrects).map(|last| last[i]).or(none);
     let seen: Vec<Seen> =
         (0..person.canonical.len()).map(|i| observe(person, frame, views, settings, i, last(i))).collect();
-    let nodes = diffuse(levels, &gather(person, &seen), f64::from(settings.smoothness));
+    let nodes = diffuse(levels, &gather(person, &seen), settings);
     let one = |(i, seen)| paint(person, settings, &nodes, i, seen, &mut state.memory[i]);
     let colors: Vec<DVec3> = seen.iter().enumerate().map(one).collect();
     state.last = Some(colors.clone());
@@ -55,7 +57,7 @@ fn observe(
 ) -> Seen {
     let mut seen = Seen::default();
     let [k, min_mask] = [settings.occlusion_per_m, settings.min_mask].map(f64::from);
-    let extra = if settings.space { 0.0 } else { 1e-3 };
+    let extra = if settings.space || settings.corrects { 0.0 } else { 1e-3 };
     let position = xyz(frame.center_scale[i]) + f64::from(frame.normal[i][3]) * xyz(frame.normal[i]);
     for view in views {
         let Some(pixel) = view.camera.project(position) else { continue };
@@ -93,7 +95,10 @@ fn observe(
             if weight > 0.0 {
                 seen.visible += weight;
                 seen.closeness = seen.closeness.max((-k * d).exp());
-                if let Some(last) = past.filter(|_| drawn.w >= 0.5) {
+                if settings.corrects {
+                    let off = color - drawn.truncate() / drawn.w;
+                    color = f64::from(settings.sharpness) * (past.unwrap_or_default() + off);
+                } else if let Some(last) = past.filter(|_| drawn.w >= 0.5) {
                     let lacking = last - drawn.truncate() / drawn.w;
                     color = (color + lacking * f64::from(settings.sharpness)).clamp(DVec3::ZERO, DVec3::ONE);
                 }
@@ -125,7 +130,8 @@ fn gather(person: &Person, seen: &[Seen]) -> Vec<DVec4> {
 }
 
 /// Cascade from the coarsest level down.
-fn diffuse(levels: &[DiffusionLevel], finest: &[DVec4], smoothness: f64) -> Vec<DVec3> {
+fn diffuse(levels: &[DiffusionLevel], finest: &[DVec4], settings: &AppearanceSettings) -> Vec<DVec3> {
+    let smoothness = f64::from(settings.smoothness);
     let mut seen = vec![finest.to_vec()];
     for pair in levels.windows(2) {
         let mut coarse = vec![DVec4::ZERO; pair[1].edges.len()];
@@ -138,7 +144,7 @@ fn diffuse(levels: &[DiffusionLevel], finest: &[DVec4], smoothness: f64) -> Vec<
         seen.push(coarse);
     }
     let root = seen[levels.len() - 1][0];
-    let mut colors = vec![if root.w > 0.0 { root.truncate() } else { DVec3::splat(MID_GREY) }];
+    let mut colors = vec![if root.w > 0.0 { root.truncate() } else { unseen(settings) }];
     for (level, seen) in levels.iter().zip(&seen).rev().skip(1) {
         colors = level.parent.iter().map(|&p| colors[p as usize]).collect();
         for _ in 0..DiffusionHierarchy::RELAX_STEPS {
@@ -169,7 +175,7 @@ pub fn exact_diffusion(
     settings: &AppearanceSettings,
 ) -> Vec<DVec3> {
     let nodes = gather_seen(person, frame, views, settings);
-    let mut colors = diffuse(levels, &nodes, f64::from(settings.smoothness));
+    let mut colors = diffuse(levels, &nodes, settings);
     for _ in 0..20_000 {
         colors = relax(&levels[0], &nodes, &colors, f64::from(settings.smoothness), 0.9);
     }
@@ -184,7 +190,7 @@ pub fn cascade_diffusion(
     views: &[View],
     settings: &AppearanceSettings,
 ) -> Vec<DVec3> {
-    let colors = diffuse(levels, &gather_seen(person, frame, views, settings), f64::from(settings.smoothness));
+    let colors = diffuse(levels, &gather_seen(person, frame, views, settings), settings);
     upsample_all(person, &colors)
 }
 
@@ -213,11 +219,15 @@ fn paint(
     memory: &mut DVec4,
 ) -> DVec3 {
     let visible = seen.visible.min(1.0);
-    let observed = if seen.weight > 0.0 { seen.color / seen.weight } else { DVec3::splat(MID_GREY) };
+    let mut observed = if seen.weight > 0.0 { seen.color / seen.weight } else { unseen(settings) };
     let own = visible / (visible + f64::from(settings.inpaint_weight));
     let share = visible + (1.0 - visible) * own;
     let current = if settings.space {
-        let filled = upsample(person, nodes, i) * (1.0 - own) + observed * own;
+        let around = upsample(person, nodes, i);
+        if settings.corrects {
+            observed += (1.0 / f64::from(settings.sharpness) - 1.0) * around;
+        }
+        let filled = around * (1.0 - own) + observed * own;
         filled * (1.0 - visible) + observed * visible
     } else {
         observed
@@ -232,6 +242,11 @@ fn paint(
     }
     let trust = memory.w / most * (1.0 - share * seen.closeness);
     current * (1.0 - trust) + memory.truncate() * trust
+}
+
+/// Colour of a surface that nobody saw.
+fn unseen(settings: &AppearanceSettings) -> DVec3 {
+    DVec3::splat(if settings.corrects { 0.0 } else { MID_GREY })
 }
 
 fn xyz(v: [f32; 4]) -> DVec3 {

@@ -83,7 +83,7 @@ impl Deformation {
         gpu: &GpuContext,
         template: &Template,
         surface: &SurfaceGaussians,
-        graph: &DeformationGraph,
+        (graph, mean): (&DeformationGraph, Option<&[DVec3]>),
         options: DeformOptions,
         pixel_m: f64,
     ) -> Result<Self, FusionError> {
@@ -99,7 +99,10 @@ impl Deformation {
         let stiffness: Vec<f64> = parts.iter().map(|&part| options.stiffness(part)).collect();
         tracker = tracker.with_stiffness(&stiffness)?;
         tracker = tracker.with_thickness(normals, parts.iter().map(|&part| part as usize).collect())?;
-        Ok(Self {
+        if let Some(mean) = mean {
+            tracker = tracker.with_mean(mean)?;
+        }
+        let mut deformation = Self {
             max_level: options.max_level,
             color_weight: options.color_weight,
             most_views: options.views,
@@ -120,9 +123,16 @@ impl Deformation {
             report: None,
             agreement: Vec::new(),
             halved: 0,
-            has_colors: false,
+            has_colors: mean.is_some(),
             had_colors: false,
-        })
+        };
+        deformation.show(gpu);
+        Ok(deformation)
+    }
+
+    /// Uploads the displacement that the nodes' translations give.
+    fn show(&mut self, gpu: &GpuContext) {
+        self.displacement.write(gpu, self.mesh.follow(self.tracker.translations()));
     }
 
     /// Solves the deformation for one frame set. Afterwards [`Self::displacement`] holds its result.
@@ -165,7 +175,7 @@ impl Deformation {
         let agreement = images.agreement(self.tracker.displacement());
         let (draw, derivatives) = images.times();
         self.keep_agreement(all_views, &chosen, &agreement);
-        self.displacement.write(gpu, self.mesh.follow(self.tracker.translations()));
+        self.show(gpu);
         self.has_colors |= !views.is_empty();
         let solve = start.elapsed().saturating_sub(prepare + draw + derivatives);
         tracing::debug!(?report, "deformation");
@@ -215,7 +225,7 @@ impl Deformation {
         let mut encoder = gpu.device.create_command_encoder(&Default::default());
         let rate = if self.had_colors { COLOR_RATE } else { 1.0 };
         self.had_colors = self.has_colors;
-        self.colors.encode(gpu, &mut encoder, &person.gaussians.color, &self.posed[0].color, rate);
+        self.colors.encode(gpu, &mut encoder, person.colors, &self.posed[0].color, rate);
         gpu.queue.submit([encoder.finish()]);
     }
 
@@ -242,10 +252,15 @@ impl Deformation {
         self.tracker.translations()
     }
 
-    /// Resumes from the node translations, metres, of an earlier deformation of the same body, whose Gaussians have colours already.
+    /// Resumes from the node translations, metres, of an earlier deformation of the same body, whose Gaussians have colours already;
+    /// from the mean shape without any.
     pub fn resume(&mut self, gpu: &GpuContext, translations: &[DVec3]) -> Result<(), FusionError> {
-        self.tracker.resume(translations)?;
-        self.displacement.write(gpu, self.mesh.follow(self.tracker.translations()));
+        if translations.is_empty() {
+            self.tracker.reset();
+        } else {
+            self.tracker.resume(translations)?;
+        }
+        self.show(gpu);
         (self.has_colors, self.had_colors) = (true, false);
         Ok(())
     }

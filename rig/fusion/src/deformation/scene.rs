@@ -4,7 +4,6 @@ use std::time::Duration;
 
 use flyrig_body::Skeleton;
 use flyrig_gpu::{GpuContext, StorageBuffer};
-use flyrig_renderer::GaussianBuffers;
 use flyrig_types::{Camera, Pose};
 
 /// One image that the person is compared with.
@@ -29,8 +28,8 @@ pub struct TrackedPerson<'a> {
     pub skeleton: &'a Skeleton,
     /// Pose at each instant at which images were taken.
     pub poses: &'a [&'a Pose],
-    /// All Gaussians, with the colours of the last painting.
-    pub gaussians: &'a GaussianBuffers,
+    /// Colours of all Gaussians: those of the last painting, or the fixed ones of an avatar.
+    pub colors: &'a StorageBuffer<[f32; 4]>,
 }
 
 /// Agreement of one view with the deformed person.

@@ -26,7 +26,7 @@ use std::{
 };
 
 use flyrig_gpu::GpuContext;
-use flyrig_renderer::{GaussianBuffers, RenderTarget, Splat};
+use flyrig_renderer::{Gaussians, RenderTarget, Splat};
 use flyrig_types::{Camera, Frame, FrameSet, Image, PersonId, Pose, RenderedView, Rig, caught};
 
 use crate::{
@@ -281,7 +281,9 @@ impl Session {
             if place.is_some_and(|place| self.subjects[place].shape_number == newcomer.shape) {
                 continue;
             }
-            let subject = self.newcomers.subject(newcomer, &self.gpu, &self.rig, &self.settings)?;
+            let avatar = self.saved.get(&id).and_then(|memory| memory.avatar.clone());
+            let with = (&self.rig, &self.settings);
+            let subject = self.newcomers.subject(newcomer, avatar.as_ref(), &self.gpu, with)?;
             let Some(mut subject) = subject else { continue };
             if self.keep_observations {
                 subject.keep_observations(&self.gpu)?;
@@ -354,10 +356,10 @@ impl Session {
         }
         self.subjects.iter_mut().for_each(|subject| subject.collect_times(&mut self.stages));
         let posed = |subject: &&Subject| subject.pose().is_some();
-        let mut people: Vec<&GaussianBuffers> = self.subjects.iter().filter(posed).map(Subject::gaussians).collect();
+        let mut people: Vec<Gaussians<'_>> = self.subjects.iter().filter(posed).map(Subject::drawn).collect();
         if people.is_empty() {
             // Before the first pose: as the surfaces were made.
-            people = self.subjects.iter().map(Subject::gaussians).collect();
+            people = self.subjects.iter().map(Subject::drawn).collect();
         }
         if people.is_empty() {
             let (width, height) = (camera.intrinsics.width, camera.intrinsics.height);
@@ -443,7 +445,9 @@ impl Session {
         let mut subjects = Vec::new();
         for old in &self.subjects {
             let (body, outfit) = (old.body().clone(), old.outfit());
-            let mut subject = Subject::new(&gpu, old.id(), (body, outfit), &self.rig, &self.settings)?;
+            let avatar = old.avatar().cloned();
+            let with = (&self.rig, &self.settings);
+            let mut subject = Subject::new(&gpu, old.id(), (body, outfit), avatar.as_ref(), with)?;
             if self.keep_observations {
                 subject.keep_observations(&gpu)?;
             }

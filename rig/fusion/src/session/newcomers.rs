@@ -3,8 +3,9 @@
 //! Sampling a surface takes seconds. A live rig goes on meanwhile: each new person is prepared in a thread of its own, named "new person",
 //! and shown once the thread has ended.
 
-use std::{collections::BTreeMap, thread::JoinHandle};
+use std::{collections::BTreeMap, sync::Arc, thread::JoinHandle};
 
+use flyrig_avatar::Avatar;
 use flyrig_body::{Outfit, Template};
 use flyrig_gpu::GpuContext;
 use flyrig_types::{PersonId, Rig};
@@ -54,9 +55,9 @@ impl Newcomers {
     pub fn subject(
         &mut self,
         newcomer: Newcomer,
+        avatar: Option<&Arc<Avatar>>,
         gpu: &GpuContext,
-        rig: &Rig,
-        settings: &SessionSettings,
+        (rig, settings): (&Rig, &SessionSettings),
     ) -> Result<Option<Subject>, FusionError> {
         let Newcomer { person, shape, template, outfit } = newcomer;
         // A person whose shape has changed meanwhile is begun again.
@@ -72,10 +73,10 @@ impl Newcomers {
             return thread.join().map_err(failed)?.map(Some);
         }
         if !self.beside {
-            return prepare(person, shape, (template, outfit), gpu, rig, settings).map(Some);
+            return prepare(person, shape, (template, outfit), avatar, gpu, (rig, settings)).map(Some);
         }
-        let (gpu, rig, settings) = (gpu.clone(), rig.clone(), settings.clone());
-        let work = move || prepare(person, shape, (template, outfit), &gpu, &rig, &settings);
+        let (gpu, rig, settings, avatar) = (gpu.clone(), rig.clone(), settings.clone(), avatar.cloned());
+        let work = move || prepare(person, shape, (template, outfit), avatar.as_ref(), &gpu, (&rig, &settings));
         let thread = std::thread::Builder::new().name(NAME.to_owned()).spawn(work);
         let thread =
             thread.map_err(|error| FusionError::ThreadFailed { name: NAME.to_owned(), panic: error.to_string() })?;
@@ -88,11 +89,11 @@ fn prepare(
     person: PersonId,
     shape: u32,
     worn: (Template, Outfit),
+    avatar: Option<&Arc<Avatar>>,
     gpu: &GpuContext,
-    rig: &Rig,
-    settings: &SessionSettings,
+    (rig, settings): (&Rig, &SessionSettings),
 ) -> Result<Subject, FusionError> {
-    let mut subject = Subject::new(gpu, person, worn, rig, settings)?;
+    let mut subject = Subject::new(gpu, person, worn, avatar, (rig, settings))?;
     subject.shape_number = shape;
     // The choice of evenly spaced points needs far more memory than its result.
     release_free_memory();

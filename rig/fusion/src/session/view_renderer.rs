@@ -1,7 +1,9 @@
 //! Rendering of all people of a session into one view.
 
 use flyrig_gpu::{GpuContext, StageTimer};
-use flyrig_renderer::{GaussianBuffers, Outputs, RasterSettings, Rasterizer, RenderTarget, ViewBytes};
+use flyrig_renderer::{
+    GaussianBuffers, GaussianJoin, Gaussians, Outputs, RasterSettings, Rasterizer, RenderTarget, ViewBytes,
+};
 use flyrig_types::{Camera, RenderedView};
 
 use crate::{error::FusionError, health::stage_times::StageTimes};
@@ -17,9 +19,11 @@ pub(crate) struct ViewRenderer {
     pub rasterizer: Rasterizer,
     /// Targets, the most recently used last.
     targets: Vec<RenderTarget>,
-    /// Gaussians of several people, one after the other.
+    /// Gaussians of several people without avatars, one after the other.
     joined: Option<GaussianBuffers>,
-    /// Whether `joined` holds the people as they are now.
+    /// Gaussians of several people, avatars among them.
+    join: GaussianJoin,
+    /// Whether the joined Gaussians are the people as they are now.
     is_current: bool,
     /// Timer of [`STAGE`].
     timer: StageTimer,
@@ -30,7 +34,15 @@ impl ViewRenderer {
     pub fn new(gpu: &GpuContext, max_gaussians: usize) -> Result<Self, FusionError> {
         let rasterizer = Rasterizer::new(gpu, max_gaussians)?;
         let (timer, bytes) = (StageTimer::new(gpu, 1), ViewBytes::new(gpu)?);
-        Ok(Self { rasterizer, targets: Vec::new(), joined: None, is_current: false, timer, bytes })
+        Ok(Self {
+            rasterizer,
+            targets: Vec::new(),
+            joined: None,
+            join: GaussianJoin::new(gpu)?,
+            is_current: false,
+            timer,
+            bytes,
+        })
     }
 
     /// Notes that a person has moved or changed colour.
@@ -47,7 +59,7 @@ impl ViewRenderer {
     pub fn render(
         &mut self,
         gpu: &GpuContext,
-        people: &[&GaussianBuffers],
+        people: &[Gaussians<'_>],
         camera: &Camera,
         stages: &mut StageTimes,
     ) -> Result<RenderedView, FusionError> {
@@ -57,10 +69,17 @@ impl ViewRenderer {
         let mut encoder = gpu.device.create_command_encoder(&Default::default());
         self.timer.begin(&mut encoder);
         let gaussians = match people {
-            [one] => one,
+            [one] => *one,
             people => {
                 let is_current = std::mem::replace(&mut self.is_current, true);
-                join(gpu, &mut encoder, people, &mut self.joined, is_current)?
+                let surfaces: Vec<&GaussianBuffers> = people.iter().filter_map(isotropic).collect();
+                if surfaces.len() == people.len() {
+                    join(gpu, &mut encoder, &surfaces, &mut self.joined, is_current)?.into()
+                } else if let (true, Some(joined)) = (is_current, self.join.joined()) {
+                    joined.into()
+                } else {
+                    self.join.encode(gpu, &mut encoder, people)?.into()
+                }
             }
         };
         let settings = RasterSettings { outputs: Outputs::COLOR, ..RasterSettings::default() };
@@ -91,6 +110,14 @@ impl ViewRenderer {
             self.targets.remove(0);
         }
         Ok(RenderTarget::of_color(gpu, size.0, size.1)?)
+    }
+}
+
+/// Returns the Gaussians of a person without an avatar.
+fn isotropic<'a>(person: &Gaussians<'a>) -> Option<&'a GaussianBuffers> {
+    match person {
+        Gaussians::Isotropic(gaussians) => Some(gaussians),
+        Gaussians::Anisotropic(_) => None,
     }
 }
 

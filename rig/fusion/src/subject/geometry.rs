@@ -3,16 +3,18 @@
 //! The nodes of the deformation graph displace the canonical Gaussians, and `body::GpuSkinner` moves them to the world. Where nodes have
 //! moved apart (skirts, coats), Gaussians are larger.
 
-use std::time::Instant;
+use std::{sync::Arc, time::Instant};
 
+use flyrig_avatar::Avatar;
 use flyrig_body::{DeformationGraph, GpuSkinner, Skeleton, SurfaceGaussians, Template, skin_mesh};
 use flyrig_gpu::GpuContext;
-use flyrig_renderer::GaussianBuffers;
+use flyrig_renderer::{GaussianBuffers, Gaussians};
 use flyrig_tracker::DeformReport;
 use flyrig_types::{Camera, Pose, Rig};
 use glam::{DVec3, Vec3};
 
 use super::{
+    figure::AvatarFigure,
     inputs::{InputView, Inputs},
     instants::Instants,
     stage_clock::{StageClock, TimedStage},
@@ -35,7 +37,7 @@ pub(super) const UNPAINTED: [f32; 4] = [0.5, 0.5, 0.5, 1.0];
 /// Gaussians of a person in the world, and the deformation that moves them beyond the pose.
 #[derive(Debug)]
 pub(super) struct Geometry {
-    skinner: GpuSkinner,
+    figure: Figure,
     /// Gaussians at the frame set's time, with the colours that are shown.
     gaussians: GaussianBuffers,
     /// Gaussians at the second, third ... instant of a frame set.
@@ -47,6 +49,15 @@ pub(super) struct Geometry {
     agreement: Vec<Option<ViewAgreement>>,
 }
 
+/// Gaussians that follow the surface.
+#[derive(Debug)]
+enum Figure {
+    /// Those of the surface itself.
+    Surface(GpuSkinner),
+    /// Those of an avatar.
+    Avatar(Box<AvatarFigure>),
+}
+
 impl Geometry {
     /// Uploads the canonical Gaussians of `surface`, grey. `rendered` are those that are drawn: `surface`, or its inset where it is
     /// deformed.
@@ -55,8 +66,8 @@ impl Geometry {
         template: &Template,
         (surface, rendered): (&SurfaceGaussians, &SurfaceGaussians),
         graph: &DeformationGraph,
-        rig: &Rig,
-        settings: &SessionSettings,
+        avatar: Option<&Arc<Avatar>>,
+        (rig, settings): (&Rig, &SessionSettings),
     ) -> Result<Self, FusionError> {
         let count = surface.positions.len();
         let gaussians = GaussianBuffers::zeroed(gpu, count)?;
@@ -66,11 +77,18 @@ impl Geometry {
         let canonical: Vec<[f32; 4]> = surface.positions.iter().map(|p| p.extend(1.0).to_array()).collect();
         gaussians.canonical.write(gpu, &canonical);
         gaussians.color.write(gpu, &vec![UNPAINTED; count]);
-        let skinner = GpuSkinner::new(gpu, rendered, &template.skeleton)?;
+        let figure = match avatar {
+            Some(avatar) => Figure::Avatar(Box::new(AvatarFigure::new(gpu, avatar, (surface, graph), &gaussians)?)),
+            None => Figure::Surface(GpuSkinner::new(gpu, rendered, &template.skeleton)?),
+        };
+        let mean = match &figure {
+            Figure::Avatar(figure) => Some(figure.mean()),
+            Figure::Surface(_) => None,
+        };
         let deformation = (settings.tracking.options())
-            .map(|options| Deformation::new(gpu, template, surface, graph, options, finest_pixel_m(rig)))
+            .map(|options| Deformation::new(gpu, template, surface, (graph, mean), options, finest_pixel_m(rig)))
             .transpose()?;
-        Ok(Self { skinner, gaussians, posed: Vec::new(), deformation, is_held: false, agreement: Vec::new() })
+        Ok(Self { figure, gaussians, posed: Vec::new(), deformation, is_held: false, agreement: Vec::new() })
     }
 
     /// Returns the Gaussians at the frame set's time.
@@ -81,6 +99,38 @@ impl Geometry {
     /// Returns the Gaussians at an instant of the last update.
     pub fn at(&self, instant: usize) -> &GaussianBuffers {
         if instant == 0 { &self.gaussians } else { &self.posed[instant - 1] }
+    }
+
+    /// Returns the avatar whose Gaussians follow the surface; `None` for those of the surface itself.
+    pub fn avatar(&self) -> Option<&Arc<Avatar>> {
+        match &self.figure {
+            Figure::Avatar(figure) => Some(figure.source()),
+            Figure::Surface(_) => None,
+        }
+    }
+
+    /// Returns the Gaussians that are drawn at an instant of the last update.
+    pub fn drawn(&self, instant: usize) -> Gaussians<'_> {
+        match &self.figure {
+            Figure::Avatar(figure) => figure.drawn(instant).map_or(self.at(instant).into(), Gaussians::Anisotropic),
+            Figure::Surface(_) => self.at(instant).into(),
+        }
+    }
+
+    /// Returns the Gaussians at the frame set's time with the colours that images paint: those of the surface, or corrections of an
+    /// avatar's.
+    pub fn painted(&self) -> &GaussianBuffers {
+        match &self.figure {
+            Figure::Avatar(figure) => figure.painted(),
+            Figure::Surface(_) => &self.gaussians,
+        }
+    }
+
+    /// Shows what was painted.
+    pub fn encode_colors(&self, gpu: &GpuContext, encoder: &mut wgpu::CommandEncoder) {
+        if let Figure::Avatar(figure) = &self.figure {
+            figure.recolor(gpu, encoder, 0, &self.gaussians);
+        }
     }
 
     /// Creates the Gaussians of further instants, sharing colours and canonical positions with the first.
@@ -146,7 +196,11 @@ impl Geometry {
                 instant: instants.of_view(i),
             })
             .collect();
-        let person = TrackedPerson { gpu, skeleton, poses: instants.poses(), gaussians: &self.gaussians };
+        let colors = match &self.figure {
+            Figure::Avatar(figure) => figure.looks(),
+            Figure::Surface(_) => &self.gaussians.color,
+        };
+        let person = TrackedPerson { gpu, skeleton, poses: instants.poses(), colors };
         let times = deformation.track(person, &tracked)?;
         self.agreement.extend_from_slice(deformation.agreement());
         stages.add("deformation", start.elapsed());
@@ -158,7 +212,7 @@ impl Geometry {
 
     /// Skins the Gaussians in the pose of each instant.
     pub fn skin(
-        &self,
+        &mut self,
         gpu: &GpuContext,
         skeleton: &Skeleton,
         instants: &Instants<'_>,
@@ -166,15 +220,24 @@ impl Geometry {
         stages: &mut StageTimes,
     ) -> Result<(), FusionError> {
         let start = Instant::now();
-        let displacement = self.deformation.as_ref().map(Deformation::displacement);
         for (i, pose) in instants.poses().iter().enumerate() {
             let mut encoder = gpu.device.create_command_encoder(&Default::default());
             if i == 0 {
                 clock.begin(&mut encoder);
             }
-            let gaussians = self.at(i);
-            let (centers, normals) = (&gaussians.center_scale, &gaussians.normal);
-            self.skinner.encode(gpu, &mut encoder, skeleton, pose, displacement, centers, normals)?;
+            let gaussians = if i == 0 { &self.gaussians } else { &self.posed[i - 1] };
+            let deformation = self.deformation.as_ref();
+            match &mut self.figure {
+                Figure::Surface(skinner) => {
+                    let (centers, normals) = (&gaussians.center_scale, &gaussians.normal);
+                    let displacement = deformation.map(Deformation::displacement);
+                    skinner.encode(gpu, &mut encoder, skeleton, pose, displacement, centers, normals)?;
+                }
+                Figure::Avatar(figure) => {
+                    let translations = deformation.map(Deformation::translations);
+                    figure.pose(gpu, &mut encoder, i, (skeleton, pose), translations, gaussians)?;
+                }
+            }
             if i + 1 == instants.poses().len() {
                 clock.mark(&mut encoder, TimedStage::Skinning);
             }
@@ -222,11 +285,10 @@ impl Geometry {
         }
     }
 
-    /// Resumes from canonical translations of the nodes, metres. Without any the body is undeformed.
+    /// Resumes from canonical translations of the nodes, metres; from the mean shape without any.
     pub fn resume(&mut self, gpu: &GpuContext, translations: &[DVec3]) -> Result<(), FusionError> {
         let Some(deformation) = &mut self.deformation else { return Ok(()) };
-        let undeformed = vec![DVec3::ZERO; deformation.translations().len()];
-        deformation.resume(gpu, if translations.is_empty() { &undeformed } else { translations })
+        deformation.resume(gpu, translations)
     }
 }
 

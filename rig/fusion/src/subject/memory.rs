@@ -1,11 +1,12 @@
 //! Learnt shape, deformation and colours of a person.
 //!
 //! A memory can be saved and given to the [`crate::SessionBuilder`] of a later program, or made of an avatar
-//! ([`PersonMemory::of_colors`]). A session resumes from it after a restart of the program or the loss of the graphics device: [`crate::LiveRig`] reads it back every
+//! ([`PersonMemory::of_avatar`]). A session resumes from it after a restart of the program or the loss of the graphics device: [`crate::LiveRig`] reads it back every
 //! ten seconds. Files of it are in [`super::memory_file`].
 
 use std::sync::Arc;
 
+use flyrig_avatar::Avatar;
 use flyrig_body::{Joint, Outfit, Skeleton, Template};
 use flyrig_stfa::FeatureMemory;
 use flyrig_stream::EncodedTemplate;
@@ -13,22 +14,21 @@ use glam::{DVec3, Vec3};
 
 use crate::error::FusionError;
 
-/// Weight of colours that are known before the first image: the one that colours reach when they are seen for long.
-const KNOWN_WEIGHT: f32 = 8.0;
 /// Learnt shape, deformation and colours of one person.
 ///
 /// # Example
 /// ```
-/// use flyrig_fusion::{PersonMemory, body::{ShapeParams, default_template}};
+/// use std::sync::Arc;
 ///
-/// // A person who is known before the first image: grey, one colour per Gaussian of `person_surface`.
+/// use flyrig_avatar::Avatar;
+/// use flyrig_fusion::{PersonMemory, body::{ShapeParams, default_template, sample_surface}};
+/// use flyrig_renderer::HarmonicOrder;
+///
+/// // A person who is known before the first image, as an avatar: grey.
 /// let body = default_template(&ShapeParams::default())?;
-/// let memory = PersonMemory::of_colors(&body, &vec![[0.2; 3]; 2000]);
-///
-/// let folder = tempfile::tempdir()?;
-/// let path = folder.path().join("person.safetensors");
-/// memory.save(&path)?;
-/// assert_eq!(PersonMemory::load(&path)?.template(&body)?.positions, body.positions);
+/// let avatar = Avatar::new(&body, &sample_surface(&body, 2000, 1)?, None, &[], HarmonicOrder::Zero)?;
+/// let memory = PersonMemory::of_avatar(Arc::new(avatar));
+/// assert_eq!(memory.template(&body)?.positions, body.positions);
 /// # Ok::<(), Box<dyn std::error::Error>>(())
 /// ```
 #[derive(Debug, Clone, PartialEq)]
@@ -51,6 +51,8 @@ pub struct PersonMemory {
     pub(crate) is_start: bool,
     /// Avatar that viewers draw from poses alone, in place of the surface and the colours that are streamed.
     pub(crate) stream: Option<Arc<EncodedTemplate>>,
+    /// Avatar whose Gaussians the person is made of.
+    pub(crate) avatar: Option<Arc<Avatar>>,
 }
 
 /// Features that the networks of learned appearance have accumulated.
@@ -83,26 +85,17 @@ impl PersonMemory {
             networks,
             is_start: false,
             stream: None,
+            avatar: None,
         }
     }
 
-    /// Describes a person who is known before the first image, undeformed. `template` is the dressed body, `colors` holds the linear RGB
-    /// of each Gaussian of [`crate::person_surface`]. The colours stay where no camera looks and yield to images elsewhere; a person who
-    /// was lost for long starts from them again. Non-finite numbers become mid grey.
+    /// Describes a person who is made of an avatar's Gaussians: they are tracked and rendered, and the images correct their colours. A
+    /// person who was lost for long starts from the avatar again.
     #[must_use]
-    pub fn of_colors(template: &Template, colors: &[[f32; 3]]) -> Self {
-        let finite = |value: f32| if value.is_finite() { value } else { 0.5 };
-        let with = |w: f32| {
-            colors
-                .iter()
-                .map(|rgb| {
-                    let [r, g, b] = rgb.map(finite);
-                    [r, g, b, w]
-                })
-                .collect()
-        };
-        let (memory, shown) = (with(KNOWN_WEIGHT), with(1.0));
-        Self { is_start: true, ..Self::new((template, Outfit::default()), Vec::new(), memory, shown, None) }
+    pub fn of_avatar(avatar: Arc<Avatar>) -> Self {
+        let none = vec![[0.0; 4]; avatar.gaussians()];
+        let known = Self::new((&avatar.template, Outfit::default()), Vec::new(), none.clone(), none, None);
+        Self { is_start: true, avatar: Some(avatar), ..known }
     }
 
     /// Lets viewers draw the person as this avatar, from poses alone. It must have the joints of the person's body.
@@ -162,14 +155,17 @@ pub(super) fn fault(name: &str, problem: String) -> FusionError {
 
 #[cfg(test)]
 mod tests {
-    use flyrig_body::{ShapeParams, default_template};
+    use flyrig_body::{ShapeParams, default_template, sample_surface};
+    use flyrig_renderer::HarmonicOrder;
 
     use super::*;
 
     #[test]
     fn a_person_of_another_body_is_refused() {
         let mut base = default_template(&ShapeParams::default()).unwrap();
-        let memory = PersonMemory::of_colors(&base, &[[0.5; 3]; 9]);
+        let surface = sample_surface(&base, 9, 1).unwrap();
+        let avatar = Avatar::new(&base, &surface, None, &[], HarmonicOrder::Zero).unwrap();
+        let memory = PersonMemory::of_avatar(Arc::new(avatar));
         base.positions.pop();
         assert!(memory.template(&base).unwrap_err().to_string().contains("vertices"));
     }

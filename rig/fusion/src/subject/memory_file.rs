@@ -29,9 +29,12 @@ impl PersonMemory {
     /// Writes a file, completely or not at all.
     ///
     /// # Errors
-    /// [`FusionError::SavedPerson`] with the system's reason.
+    /// [`FusionError::SavedPerson`] with the system's reason, and for a person made of an avatar.
     pub fn save(&self, path: &Path) -> Result<(), FusionError> {
         let fail = |problem: String| fault(&path.display().to_string(), problem);
+        if self.avatar.is_some() {
+            return Err(fail("is made of an avatar, which has a file of its own; name that as body.avatar".to_owned()));
+        }
         let tensors = self.tensors();
         let views: Vec<(&str, TensorView<'_>)> = tensors
             .iter()
@@ -73,6 +76,7 @@ impl PersonMemory {
             networks: reader.networks()?,
             is_start: false,
             stream: None,
+            avatar: None,
         })
     }
 

@@ -3,6 +3,7 @@
 //! [`person`] has the [`Subject`] and its update, [`geometry`] the deformation and skinning, [`painter`] the colours. [`memory`] outlives
 //! the subject, [`stream_frame`] is what viewers get of it.
 
+mod figure;
 mod geometry;
 pub(crate) mod inputs;
 mod instants;

@@ -57,7 +57,7 @@ impl GaussianPainter {
         surface: &SurfaceGaussians,
         graph: &DeformationGraph,
         body: &BodyGraph,
-        cameras: usize,
+        (cameras, is_avatar): (usize, bool),
         settings: &SessionSettings,
     ) -> Result<Self, FusionError> {
         let mut direct = DirectPainter {
@@ -66,6 +66,10 @@ impl GaussianPainter {
             visibility: Vec::new(),
             painted: Vec::new(),
         };
+        if is_avatar {
+            direct.settings.corrects = true;
+            return Ok(Self::Direct(Box::new(direct)));
+        }
         let Some(parameters) = settings.appearance.load_networks()? else { return Ok(Self::Direct(Box::new(direct))) };
         direct.appearance.keep_observations(gpu)?;
         let networks = LearnedAppearance::new(&parameters, body.clone());
@@ -207,7 +211,7 @@ impl DirectPainter {
         for (i, view) in views.iter().enumerate() {
             self.fit_target(gpu, i, (view.image.width(), view.image.height()))?;
             let mut encoder = gpu.device.create_command_encoder(&Default::default());
-            let gaussians = geometry.at(instants.of_view(i));
+            let gaussians = geometry.drawn(instants.of_view(i));
             tools.rasterizer.encode(gpu, &mut encoder, gaussians, view.camera, &settings, &self.visibility[i])?;
             if i + 1 == views.len() {
                 tools.clock.mark(&mut encoder, TimedStage::Visibility);
@@ -249,7 +253,8 @@ impl DirectPainter {
         if views.is_empty() {
             tools.clock.mark(&mut encoder, TimedStage::Visibility);
         }
-        self.appearance.update(gpu, &mut encoder, geometry.gaussians(), &observing, &self.settings)?;
+        self.appearance.update(gpu, &mut encoder, geometry.painted(), &observing, &self.settings)?;
+        geometry.encode_colors(gpu, &mut encoder);
         tools.clock.mark(&mut encoder, TimedStage::Appearance);
         tools.clock.finish(&mut encoder);
         gpu.queue.submit([encoder.finish()]);

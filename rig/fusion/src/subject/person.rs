@@ -13,9 +13,10 @@
 
 use std::sync::Arc;
 
-use flyrig_body::{Outfit, Template};
+use flyrig_avatar::Avatar;
+use flyrig_body::{DEFAULT_SIGMA2_M2, Outfit, Template, build_graph};
 use flyrig_gpu::GpuContext;
-use flyrig_renderer::{GaussianBuffers, Observations, Rasterizer, Splat, read_splats};
+use flyrig_renderer::{GaussianBuffers, Gaussians, Observations, Rasterizer, Splat, read_splats};
 use flyrig_stfa::BodyGraph;
 use flyrig_stream::{EncodedTemplate, Motion, Stamp};
 use flyrig_tracker::DeformReport;
@@ -85,6 +86,14 @@ pub(crate) struct PersonTrack {
     pub viewed: Vec<usize>,
 }
 
+/// Returns whether this body is an avatar's; it may have more joints: fingers.
+fn is_of(avatar: &Avatar, template: &Template) -> bool {
+    let names = |template: &Template| -> Vec<String> {
+        template.skeleton.joints().iter().map(|joint| joint.name.clone()).collect()
+    };
+    avatar.template.positions == template.positions && names(template).starts_with(&names(&avatar.template))
+}
+
 /// One person as Gaussians on the GPU, with shape, deformation, colour memory and tracking quality.
 #[derive(Debug)]
 pub struct Subject {
@@ -110,11 +119,20 @@ impl Subject {
         gpu: &GpuContext,
         id: PersonId,
         (body, outfit): (Template, Outfit),
-        rig: &Rig,
-        settings: &SessionSettings,
+        avatar: Option<&Arc<Avatar>>,
+        (rig, settings): (&Rig, &SessionSettings),
     ) -> Result<Self, FusionError> {
         let template = outfit.on(&body)?;
-        let (surface, graph) = person_surface(&template, &settings.body)?;
+        let avatar = avatar.filter(|avatar| is_of(avatar, &template));
+        let (surface, graph) = match avatar {
+            Some(avatar) => {
+                let surface = avatar.attached_surface()?;
+                let nodes = avatar.hanging.as_ref().map_or(settings.body.nodes, |hanging| hanging.nodes.len());
+                let graph = build_graph(&template, &surface, nodes, DEFAULT_SIGMA2_M2)?;
+                (surface, graph)
+            }
+            None => person_surface(&template, &settings.body)?,
+        };
         let is_deformed = settings.tracking.options().is_some();
         let inset = is_deformed.then(|| surface.inset());
         let rendered = inset.as_ref().unwrap_or(&surface);
@@ -123,8 +141,15 @@ impl Subject {
         Ok(Self {
             id,
             shape_number: 0,
-            geometry: Geometry::new(gpu, &template, (&surface, rendered), &graph, rig, settings)?,
-            painter: GaussianPainter::new(gpu, &surface, &graph, &body_graph, rig.cameras.len(), settings)?,
+            geometry: Geometry::new(gpu, &template, (&surface, rendered), &graph, avatar, (rig, settings))?,
+            painter: GaussianPainter::new(
+                gpu,
+                &surface,
+                &graph,
+                &body_graph,
+                (rig.cameras.len(), avatar.is_some()),
+                settings,
+            )?,
             shape: PersonShape {
                 template,
                 undressed: (!outfit.is_bare()).then_some((body, outfit)),
@@ -246,7 +271,12 @@ impl Subject {
         self.geometry.node_translations()
     }
 
-    /// Returns the Gaussians as they are drawn.
+    /// Returns the Gaussians that are drawn.
+    pub(crate) fn drawn(&self) -> Gaussians<'_> {
+        self.geometry.drawn(0)
+    }
+
+    /// Returns one Gaussian of the surface for each that is drawn.
     pub(crate) fn gaussians(&self) -> &GaussianBuffers {
         self.geometry.gaussians()
     }

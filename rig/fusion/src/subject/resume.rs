@@ -2,6 +2,7 @@
 
 use std::sync::Arc;
 
+use flyrig_avatar::Avatar;
 use flyrig_gpu::GpuContext;
 
 use super::{memory::PersonMemory, person::Subject};
@@ -24,12 +25,17 @@ impl Subject {
         let translations = self.node_translations().to_vec();
         let networks = self.painter.network_memory();
         let memory = self.painter.memory(gpu)?;
-        let colors = self.painter.direct_colors(gpu, self.gaussians())?;
-        Ok(PersonMemory::new((self.body(), self.outfit()), translations, memory, colors, networks))
+        let colors = self.painter.direct_colors(gpu, self.geometry.painted())?;
+        let known = PersonMemory::new((self.body(), self.outfit()), translations, memory, colors, networks);
+        Ok(PersonMemory { avatar: self.geometry.avatar().cloned(), ..known })
     }
 
     /// Resumes from what an earlier session has learnt about the same person.
     pub(crate) fn restore(&mut self, gpu: &GpuContext, memory: &PersonMemory) -> Result<(), FusionError> {
+        if memory.avatar.is_some() && self.geometry.avatar().is_none() {
+            tracing::warn!("person {} has another body than the avatar and starts without it", self.id);
+            return Ok(());
+        }
         let count = self.gaussians().count();
         if memory.colors.len() != count {
             return Err(FusionError::SavedPerson {
@@ -51,6 +57,11 @@ impl Subject {
         Ok(())
     }
 
+    /// Returns the avatar whose Gaussians the person is made of.
+    pub(crate) fn avatar(&self) -> Option<&Arc<Avatar>> {
+        self.geometry.avatar()
+    }
+
     /// Keeps what is known before the first image.
     fn start_from(&mut self, start: Arc<PersonMemory>) {
         if let Some(avatar) = &start.stream {
@@ -66,7 +77,7 @@ impl Subject {
     /// Shows the deformation and colours of a memory with the same number of Gaussians.
     fn show(&mut self, gpu: &GpuContext, memory: &PersonMemory) -> Result<(), FusionError> {
         self.geometry.resume(gpu, &memory.translations)?;
-        self.painter.resume(gpu, self.geometry.gaussians(), memory)
+        self.painter.resume(gpu, self.geometry.painted(), memory)
     }
 
     /// Takes over what belongs to no device (poses, tracking quality, the networks' memory) from the subject of the same person on

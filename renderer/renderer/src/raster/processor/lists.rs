@@ -54,6 +54,8 @@ pub(crate) struct Anisotropic<'a> {
     pub colors: Harmonics<'a>,
     pub scale_opacity: &'a [[f32; 4]],
     pub rotation: &'a [[f32; 4]],
+    /// Normals of the surface, where the Gaussians belong to one.
+    pub normal: Option<&'a [[f32; 4]]>,
 }
 
 impl Source for Anisotropic<'_> {
@@ -63,7 +65,8 @@ impl Source for Anisotropic<'_> {
 
     #[inline(always)]
     fn splat(&self, projection: &Projection<'_>, i: usize) -> Option<(ProjectedSplat, Rect)> {
-        projection.anisotropic(&self.colors.center[i], &self.scale_opacity[i], &self.rotation[i])
+        let normal = self.normal.map(|normals| &normals[i]);
+        projection.anisotropic(&self.colors.center[i], &self.scale_opacity[i], &self.rotation[i], normal)
     }
 
     fn harmonics(&self) -> Option<Harmonics<'_>> {

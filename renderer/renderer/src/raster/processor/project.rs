@@ -3,7 +3,7 @@
 use flyrig_gpu::CameraConstants;
 use glam::{Vec2, Vec3, Vec4};
 
-use crate::raster::kernels::{BACKFACING_COSINE, CUT};
+use crate::raster::kernels::{AWAY_COSINE, BACKFACING_COSINE, CUT};
 use crate::raster::processor::shape::{Shape, rows_along, rows_of};
 use crate::raster::settings::RasterSettings;
 
@@ -64,17 +64,8 @@ impl Projection<'_> {
             return None;
         }
         let world = Vec3::new(x, y, z);
-        if self.settings.cull_backfacing {
-            let n = Vec4::from(*normal).truncate();
-            let sight = world - self.camera.center();
-            let cosine = BACKFACING_COSINE as f32;
-            // Squared where the signs allow it: most Gaussians need no root.
-            let along = n.dot(sight);
-            let facing_away =
-                along > 0.0 && along * along > cosine * cosine * n.length_squared() * sight.length_squared();
-            if !finite(normal) || facing_away {
-                return None;
-            }
+        if self.settings.cull_backfacing && self.faces_away(world, normal, BACKFACING_COSINE as f32) {
+            return None;
         }
         if self.settings.outputs.canonical && !finite(canonical) {
             return None;
@@ -85,23 +76,41 @@ impl Projection<'_> {
     }
 
     /// Projects an anisotropic Gaussian to its splat and tiles; `None` where it is not drawn. Elements as in
-    /// [`AnisotropicBuffers`](crate::AnisotropicBuffers).
+    /// [`AnisotropicBuffers`](crate::AnisotropicBuffers); `normal` is that of its surface.
     #[inline(always)]
     pub fn anisotropic(
         &self,
         center: &[f32; 4],
         scale_opacity: &[f32; 4],
         rotation: &[f32; 4],
+        normal: Option<&[f32; 4]>,
     ) -> Option<(ProjectedSplat, Rect)> {
         let world = Vec4::from(*center).truncate();
         let shape = Shape::new(scale_opacity, rotation)?;
         if !(world.is_finite() && shape.opacity > 0.0) {
             return None;
         }
+        if let Some(normal) = normal
+            && self.settings.cull_backfacing
+            && self.faces_away(world, normal, AWAY_COSINE as f32)
+        {
+            return None;
+        }
         let in_camera = self.camera.to_camera(world);
         let (pixel, jacobian) = self.camera.project_with_jacobian(in_camera, self.settings.near_m)?;
         let rows = rows_along(&jacobian, &shape.axes_in_camera(&self.camera)).map(|row| row * shape.scale_m);
         self.splat(pixel, in_camera.z, rows, shape.opacity)
+    }
+
+    /// Returns whether a surface faces away from the camera or its normal is not finite.
+    #[inline(always)]
+    fn faces_away(&self, world: Vec3, normal: &[f32; 4], cosine: f32) -> bool {
+        let n = Vec4::from(*normal).truncate();
+        let sight = world - self.camera.center();
+        // Squared where the signs allow it: most Gaussians need no root.
+        let along = n.dot(sight);
+        let is_away = along > 0.0 && along * along > cosine * cosine * n.length_squared() * sight.length_squared();
+        is_away || !Vec4::from(*normal).is_finite()
     }
 
     /// Returns the splat whose covariance before the filter is M M^T, with these rows of the 2x3 matrix M.

@@ -69,9 +69,16 @@ impl ProcessorRasterizer {
                 let [Some(center), Some(scale_opacity), Some(rotation), Some(harmonics)] = &slices else { return };
                 let coefficients = buffers.order().coefficients();
                 let colors = Harmonics { center, harmonics, coefficients, eye: constants.center() };
-                self.lists.fill(&projection, Anisotropic { colors, scale_opacity, rotation });
+                let surface =
+                    buffers.surface.as_ref().map(|surface| (surface.normal.slice(), surface.canonical.slice()));
+                let (normal, canonical) = match &surface {
+                    Some((Some(normal), Some(canonical))) => (Some(normal.as_slice()), canonical.as_slice()),
+                    Some(_) => return,
+                    None => (None, &[][..]),
+                };
+                self.lists.fill(&projection, Anisotropic { colors, scale_opacity, rotation, normal });
                 let painted = std::mem::take(&mut self.lists.painted);
-                let tiles = self.blend(&projection, &painted, &[], target);
+                let tiles = self.blend(&projection, &painted, canonical, target);
                 self.lists.painted = painted;
                 tiles
             }

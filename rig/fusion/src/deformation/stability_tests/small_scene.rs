@@ -144,7 +144,8 @@ impl TestedDeformation {
         gaussians.color.write(gpu, &scene.colors);
         Self {
             gpu: gpu.clone(),
-            deformation: Deformation::new(gpu, &scene.template, &scene.surface, &scene.graph, options, 0.01).unwrap(),
+            deformation: Deformation::new(gpu, &scene.template, &scene.surface, (&scene.graph, None), options, 0.01)
+                .unwrap(),
             gaussians,
             skinner: GpuSkinner::new(gpu, &scene.surface.inset(), &scene.template.skeleton).unwrap(),
         }
@@ -157,7 +158,7 @@ impl TestedDeformation {
             gpu: &self.gpu,
             skeleton: &scene.template.skeleton,
             poses: &instants,
-            gaussians: &self.gaussians,
+            colors: &self.gaussians.color,
         };
         let image = |rgba: &Vec<u8>| StorageBuffer::from_bytes(&self.gpu, "image", rgba).unwrap();
         let images: Vec<_> = shot.rgba.iter().map(image).collect();

@@ -1,0 +1,148 @@
+//! Gaussians of an avatar as a tracked person: posed on the deformation's nodes, their colours corrected by the images.
+
+use std::sync::Arc;
+
+use flyrig_avatar::{Avatar, Bones, PosedAvatar};
+use flyrig_body::{DeformationGraph, Skeleton, SurfaceGaussians};
+use flyrig_gpu::{GpuContext, StorageBuffer};
+use flyrig_renderer::{AnisotropicBuffers, Corrected, GaussianBuffers, Recolor};
+use flyrig_types::Pose;
+use glam::{DVec3, Vec3};
+use wgpu::CommandEncoder;
+
+use crate::error::FusionError;
+
+/// Avatar on the device, at each instant of a frame set.
+#[derive(Debug)]
+pub(super) struct AvatarFigure {
+    source: Arc<Avatar>,
+    /// The avatar, hung on the session's graph.
+    avatar: Avatar,
+    canonical: Vec<[f32; 4]>,
+    posed: PosedAvatar,
+    recolor: Recolor,
+    instants: Vec<Instant>,
+    /// Colour that each Gaussian of the surface shows under the mean light of the take, linear RGB.
+    look: StorageBuffer<[f32; 4]>,
+    /// Gaussians at the frame set's time with the corrections as colours: what the images paint.
+    painted: GaussianBuffers,
+}
+
+/// Avatar at one instant.
+#[derive(Debug)]
+struct Instant {
+    drawn: AnisotropicBuffers,
+    /// Constant harmonics under the room's light, without correction.
+    constant: StorageBuffer<[f32; 4]>,
+}
+
+impl AvatarFigure {
+    /// Hangs an avatar on the graph of its [`Avatar::attached_surface`]. `gaussians` are those at the frame set's time.
+    pub fn new(
+        gpu: &GpuContext,
+        source: &Arc<Avatar>,
+        (surface, graph): (&SurfaceGaussians, &DeformationGraph),
+        gaussians: &GaussianBuffers,
+    ) -> Result<Self, FusionError> {
+        let looks: Vec<[f32; 4]> = source.surface_colors(surface).into_iter().map(|[r, g, b]| [r, g, b, 1.0]).collect();
+        gaussians.color.write(gpu, &looks);
+        let avatar = source.hung_on(graph);
+        let canonical: Vec<[f32; 4]> = avatar.centers().iter().map(|p| p.extend(1.0).to_array()).collect();
+        gaussians.canonical.write(gpu, &canonical);
+        let corrections = StorageBuffer::zeroed(gpu, "colour corrections", canonical.len())?;
+        let GaussianBuffers { center_scale, normal, canonical: positions, .. } = gaussians;
+        Ok(Self {
+            recolor: Recolor::new(gpu, avatar.parameters.order()),
+            painted: GaussianBuffers {
+                center_scale: center_scale.clone(),
+                normal: normal.clone(),
+                color: corrections,
+                canonical: positions.clone(),
+            },
+            source: Arc::clone(source),
+            avatar,
+            canonical,
+            posed: PosedAvatar::default(),
+            look: StorageBuffer::from_slice(gpu, "looks of the surface", &looks)?,
+            instants: Vec::new(),
+        })
+    }
+
+    /// Returns the avatar as it was given.
+    pub fn source(&self) -> &Arc<Avatar> {
+        &self.source
+    }
+
+    /// Returns the mean translations of the graph's nodes, canonical metres.
+    pub fn mean(&self) -> &[DVec3] {
+        self.avatar.hanging.as_ref().map_or(&[], |hanging| &hanging.mean)
+    }
+
+    /// Returns the colours of the surface without corrections. Corrections follow the images wherever the surface slides; colours
+    /// that stay hold it.
+    pub fn looks(&self) -> &StorageBuffer<[f32; 4]> {
+        &self.look
+    }
+
+    /// Returns the Gaussians at the frame set's time with the corrections as colours.
+    pub fn painted(&self) -> &GaussianBuffers {
+        &self.painted
+    }
+
+    /// Returns the Gaussians at an instant of the last update; `None` before it.
+    pub fn drawn(&self, instant: usize) -> Option<&AnisotropicBuffers> {
+        self.instants.get(instant).map(|instant| &instant.drawn)
+    }
+
+    /// Poses the avatar at an instant, with the last corrections. Centres and normals go to `gaussians` as well.
+    pub fn pose(
+        &mut self,
+        gpu: &GpuContext,
+        encoder: &mut CommandEncoder,
+        instant: usize,
+        (skeleton, pose): (&Skeleton, &Pose),
+        translations: Option<&[DVec3]>,
+        gaussians: &GaussianBuffers,
+    ) -> Result<(), FusionError> {
+        let count = self.canonical.len();
+        while self.instants.len() <= instant {
+            let drawn = AnisotropicBuffers::zeroed(gpu, count, self.avatar.parameters.order())?.with_surface(gpu)?;
+            if let Some(surface) = &drawn.surface {
+                surface.canonical.write(gpu, &self.canonical);
+            }
+            let constant = StorageBuffer::zeroed(gpu, "constant harmonics", count)?;
+            self.instants.push(Instant { drawn, constant });
+        }
+        self.avatar.pose(&Bones::new(skeleton, pose), translations, &mut self.posed);
+        let PosedAvatar { center, scale_opacity, rotation, harmonics, .. } = &self.posed;
+        let Instant { drawn, constant } = &self.instants[instant];
+        let normals: Vec<[f32; 4]> = self.posed.normals().map(|normal| normal.extend(0.0).to_array()).collect();
+        let isotropic = |(center, scales): (&[f32; 4], &[f32; 4])| {
+            let [a, b, c, _] = *scales;
+            Vec3::from_slice(center).extend((a * b * c).cbrt()).to_array()
+        };
+        let centers: Vec<[f32; 4]> = center.iter().zip(scale_opacity).map(isotropic).collect();
+        gaussians.center_scale.write(gpu, &centers);
+        gaussians.normal.write(gpu, &normals);
+        drawn.center.write(gpu, center);
+        drawn.scale_opacity.write(gpu, scale_opacity);
+        drawn.rotation.write(gpu, rotation);
+        drawn.harmonics.write(gpu, harmonics);
+        if let Some(surface) = &drawn.surface {
+            surface.normal.write(gpu, &normals);
+        }
+        let coefficients = self.avatar.parameters.order().coefficients();
+        let constants: Vec<[f32; 4]> = harmonics.iter().step_by(coefficients).copied().collect();
+        constant.write(gpu, &constants);
+        self.recolor(gpu, encoder, instant, gaussians);
+        Ok(())
+    }
+
+    /// Adds the corrections to the colours at an instant.
+    pub fn recolor(&self, gpu: &GpuContext, encoder: &mut CommandEncoder, instant: usize, gaussians: &GaussianBuffers) {
+        let Some(Instant { drawn, constant }) = self.instants.get(instant) else { return };
+        let corrected =
+            Corrected { constant, correction: &self.painted.color, look: &self.look, color: &gaussians.color };
+        self.recolor.encode(gpu, encoder, drawn, corrected);
+    }
+}
