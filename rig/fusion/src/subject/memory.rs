@@ -21,7 +21,8 @@ use crate::error::FusionError;
 /// use std::sync::Arc;
 ///
 /// use flyrig_avatar::Avatar;
-/// use flyrig_fusion::{PersonMemory, body::{ShapeParams, default_template, sample_surface}};
+/// use flyrig_body::{ShapeParams, default_template, sample_surface};
+/// use flyrig_fusion::PersonMemory;
 /// use flyrig_renderer::HarmonicOrder;
 ///
 /// // A person who is known before the first image, as an avatar: grey.
