@@ -87,7 +87,7 @@ pub fn write_glb(path: &Path, template: &Template, contents: GlbContents<'_>) ->
 }
 
 fn animation(glb: &mut GlbWriter, keys: &[(i64, flyrig_types::Pose)], joints: usize) -> Value {
-    let times: Vec<f32> = keys.iter().map(|(nanos, _)| (*nanos as f64 * 1e-9) as f32).collect();
+    let times = key_times(keys.iter().map(|(nanos, _)| *nanos));
     let times = glb.floats(&times, "SCALAR", 1);
     let (mut samplers, mut channels) = (Vec::new(), Vec::new());
     let mut channel = |node: usize, what: &str, output: usize| {
@@ -102,6 +102,18 @@ fn animation(glb: &mut GlbWriter, keys: &[(i64, flyrig_types::Pose)], joints: us
         channel(joint, "rotation", glb.floats(&turns, "VEC4", 4));
     }
     json!({ "samplers": samplers, "channels": channels })
+}
+
+/// Returns key times in seconds. Of times that single precision cannot tell apart, the earlier ones move back, so that all grow: a motion
+/// that repeats jumps within a nanosecond.
+fn key_times(nanos: impl Iterator<Item = i64>) -> Vec<f32> {
+    let mut times: Vec<f32> = nanos.map(|nanos| (nanos as f64 * 1e-9) as f32).collect();
+    let mut next = f32::INFINITY;
+    for time in times.iter_mut().rev() {
+        *time = time.min(next.next_down());
+        next = *time;
+    }
+    times
 }
 
 #[cfg(test)]
@@ -140,6 +152,14 @@ mod tests {
                 assert!(a.distance(*b) < 1e-5, "{nanos}: {a} {b}");
             }
         }
+        // A motion that repeats for minutes.
+        let long = track.repeated_until(300_000_000_000);
+        write_glb(&path, &template, GlbContents { track: Some(&long), texture: None }).unwrap();
+        let read = load_gltf(&path).unwrap().track.unwrap();
+        assert_eq!((read.keys().len(), read.span_nanos()), (long.keys().len(), long.span_nanos()));
+        let (a, _) = skin_mesh(&human.template, &read.at(299_500_000_000));
+        let (b, _) = skin_mesh(&template, &track.at(0));
+        assert!(a.iter().zip(&b).all(|(a, b)| a.distance(*b) < 1e-4), "the later of two keys keeps its time");
         // A pose of another body.
         let single = Pose { root_translation: DVec3::ZERO, joint_rotations: vec![DQuat::IDENTITY] };
         let other = PoseTrack::new(vec![(0, single)]).unwrap();
