@@ -72,10 +72,11 @@ fn open(args: &EvalArgs, plan: &EvalPlan, gpu: &GpuContext) -> Result<Vec<Run>> 
             eprintln!("eval: reconstruction {} of {count}, {without}", index + 1);
         }
         let replay = Replay::open(&args.replay(split, known.clone()), gpu);
-        let replay = match split.holdout.as_slice() {
+        let mut replay = match split.holdout.as_slice() {
             [held] if count > 1 => replay.with_context(|| format!("without camera {held}"))?,
             _ => replay?,
         };
+        replay.session.set_learning_steps(args.learn_steps);
         Ok(Run::new(replay))
     };
     plan.splits.iter().enumerate().map(open).collect()

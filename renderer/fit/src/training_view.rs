@@ -60,13 +60,33 @@ impl TrainingView {
         Some(Self { frame, camera, rgba: cut, mixed })
     }
 
+    /// Returns the same image as one of another frame.
+    #[must_use]
+    pub fn of_frame(self, frame: usize) -> Self {
+        Self { frame, ..self }
+    }
+
+    /// Returns the camera of the crop.
+    #[must_use]
+    pub fn camera(&self) -> &Camera {
+        &self.camera
+    }
+
+    /// Returns the pixels of the crop: sRGB with the mask as alpha.
+    #[must_use]
+    pub fn rgba(&self) -> &[u8] {
+        &self.rgba
+    }
+
     /// Returns width and height, pixels.
-    pub(crate) fn size(&self) -> [u32; 2] {
+    #[must_use]
+    pub fn size(&self) -> [u32; 2] {
         [self.camera.intrinsics.width, self.camera.intrinsics.height]
     }
 
     /// Returns the pixels to compare with.
-    pub(crate) fn photograph(&self) -> Photograph<'_> {
+    #[must_use]
+    pub fn photograph(&self) -> Photograph<'_> {
         Photograph { rgba: &self.rgba, mixed: &self.mixed }
     }
 }

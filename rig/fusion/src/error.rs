@@ -1,7 +1,9 @@
 //! Errors of a session and of a live rig.
 
+use flyrig_avatar::AvatarError;
 use flyrig_body::BodyError;
 use flyrig_capture::CaptureError;
+use flyrig_fit::FitError;
 use flyrig_gpu::GpuError;
 use flyrig_renderer::{AppearanceError, BackwardError};
 use flyrig_stfa::StfaError;
@@ -24,6 +26,12 @@ pub enum FusionError {
     /// Error of the derivatives of a rendered view.
     #[error(transparent)]
     Backward(#[from] BackwardError),
+    /// Error of the person's avatar.
+    #[error(transparent)]
+    Avatar(#[from] AvatarError),
+    /// Error of the fit of the person's avatar.
+    #[error(transparent)]
+    Fit(#[from] FitError),
     /// Error of the networks of learned appearance.
     #[error(transparent)]
     Networks(#[from] StfaError),
@@ -98,9 +106,10 @@ impl FusionError {
     pub fn is_device_fault(&self) -> bool {
         match self {
             Self::Gpu(error) => error.is_device_fault(),
-            Self::Appearance(AppearanceError::Gpu(error)) | Self::Backward(BackwardError::Gpu(error)) => {
-                error.is_device_fault()
-            }
+            Self::Appearance(AppearanceError::Gpu(error))
+            | Self::Backward(BackwardError::Gpu(error))
+            | Self::Avatar(AvatarError::Gpu(error))
+            | Self::Fit(FitError::Gpu(error)) => error.is_device_fault(),
             _ => false,
         }
     }

@@ -16,6 +16,7 @@
 //! | frames of the cameras to a frame set | `intake` |
 //! | frame set to poses and masks of people | `perception` |
 //! | poses, masks and images to Gaussians | `session`, `subject`, `deformation` |
+//! | images of the past to an avatar of the person | `learner` |
 //! | Gaussians to views, streams and statistics | `publish` |
 //! | steps, look-ahead and recovery of a live rig | `live` |
 //!
@@ -26,6 +27,7 @@
 //! | caller of [`LiveRig::step`] ("pipeline") | everything else; owns the GPU queue | one |
 //! | "perception" | observes the next frame set beside the pipeline | one, per frame set |
 //! | "shape", "new person" | measures a person who has come, prepares the subject | one each per such person, for seconds |
+//! | "learner" | fits an avatar to the first person, with `body.learn` | one |
 //! | "encode" | compresses views | one |
 //! | "person" | encodes the person stream | one |
 //!
@@ -36,6 +38,7 @@ mod deformation;
 mod error;
 mod health;
 mod intake;
+mod learner;
 mod live;
 mod perception;
 mod publish;

@@ -60,8 +60,15 @@ fn images_correct_an_avatar_and_another_device_goes_on_with_it() {
 
         let memory = session.memory(ME).unwrap();
         let folder = tempfile::tempdir().unwrap();
-        let refused = memory.save(&folder.path().join("me.person")).unwrap_err().to_string();
-        assert!(refused.contains("body.avatar"), "{refused}");
+        let path = folder.path().join("me.person");
+        memory.save(&path).unwrap();
+        assert_eq!(PersonMemory::load(&path).unwrap(), memory);
+        let whole = std::fs::read(&path).unwrap();
+        let at = whole.windows(9).rposition(|window| window == b"flyavatar").unwrap();
+        let broken = [&whole[..at], b"flyAvatar", &whole[at + 9..]].concat();
+        std::fs::write(&path, broken).unwrap();
+        let refused = PersonMemory::load(&path).unwrap_err().to_string();
+        assert!(refused.contains("its avatar") && refused.contains("delete it"), "{refused}");
         if session.gpu().is_on_processor() {
             continue;
         }

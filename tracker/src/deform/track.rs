@@ -164,10 +164,22 @@ impl DeformTracker {
     /// # Errors
     /// [`TrackErrorKind::Template`] unless there is one finite translation per node.
     pub fn with_mean(mut self, translations: &[DVec3]) -> Result<Self, TrackError> {
-        self.check_translations(translations)?;
-        self.regularizer.mean = translations.to_vec();
+        self.set_mean(translations)?;
         self.reset();
         Ok(self)
+    }
+
+    /// Replaces the mean shape, canonical metres, from the next frame set on; translations are kept.
+    ///
+    /// # Errors
+    /// Those of [`Self::with_mean`].
+    pub fn set_mean(&mut self, translations: &[DVec3]) -> Result<(), TrackError> {
+        self.check_translations(translations)?;
+        self.regularizer.mean = translations.to_vec();
+        if let Some(thickness) = &mut self.thickness {
+            thickness.forget();
+        }
+        Ok(())
     }
 
     /// Resets to the mean shape; the next frame set counts as the first.

@@ -5,16 +5,17 @@ use std::path::Path;
 use anyhow::{Result, ensure};
 use flyrig_avatar::Avatar;
 use flyrig_body::Template;
-use flyrig_fusion::{AppearanceOptions, BodySettings, BudgetSettings, SessionSettings};
+use flyrig_fusion::{AppearanceOptions, BodySettings, BudgetSettings, PersonMemory, SessionSettings};
 use flyrig_gpu::GpuContext;
 use flyrig_takes::{Replay, ReplaySettings};
 
 use crate::arguments::DatasetArgs;
 
-/// Loads an avatar.
+/// Loads an avatar, or the one in a file of `body.person` that a rig has learnt.
 pub(super) fn load(path: &Path) -> Result<Avatar> {
     ensure!(path.exists(), "{} does not exist; `flyrig avatar build` makes an avatar", path.display());
-    Ok(Avatar::load(path)?)
+    let learnt = || PersonMemory::load(path).ok()?.avatar().map(|avatar| (**avatar).clone());
+    Avatar::load(path).or_else(|error| learnt().ok_or(error)).map_err(Into::into)
 }
 
 /// Prints the mean share of the body in poses unlike those that the avatar was built from.

@@ -31,6 +31,9 @@ pub struct EvalArgs {
     /// Avatar of the person (`flyrig avatar build`), from which tracking and colours start.
     #[arg(long, value_name = "FILE")]
     pub avatar: Option<PathBuf>,
+    /// Steps of fitting after each frame set, with --learn.
+    #[arg(long, default_value_t = 4, value_name = "STEPS", requires = "learn", value_parser = clap::value_parser!(u32).range(1..=1000))]
+    pub learn_steps: u32,
     #[command(flatten)]
     pub appearance: AppearanceOptions,
     #[command(flatten)]

@@ -76,6 +76,17 @@ impl GaussianParameters {
         self.harmonics.resize(self.len() * self.order.coefficients(), [0.0; 4]);
     }
 
+    /// Moves every number by a share, 0..=1, of its difference to `target`, which has the same form.
+    pub fn approach(&mut self, target: &Self, share: f32) {
+        for (list, target) in self.lists_mut().into_iter().zip(target.lists()) {
+            list.par_iter_mut().zip(target).with_min_len(1024).for_each(|(row, target)| {
+                // At the end exactly: differences are rounded.
+                *row =
+                    if share >= 1.0 { *target } else { std::array::from_fn(|k| row[k] + share * (target[k] - row[k])) };
+            });
+        }
+    }
+
     /// Returns whether every number is finite.
     #[must_use]
     pub fn is_finite(&self) -> bool {

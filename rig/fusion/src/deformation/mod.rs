@@ -241,6 +241,11 @@ impl Deformation {
         }
     }
 
+    /// Replaces the mean shape, canonical metres per node, from the next frame set on.
+    pub fn set_mean(&mut self, mean: &[DVec3]) -> Result<(), FusionError> {
+        Ok(self.tracker.set_mean(mean)?)
+    }
+
     /// Returns to the undeformed body, for another person.
     pub fn reset(&mut self) {
         self.tracker.reset();

@@ -10,8 +10,8 @@ use super::{
     view_renderer::ViewRenderer,
 };
 use crate::{
-    error::FusionError, health::stage_times::StageTimes, perception::observation::Perception,
-    settings::session::SessionSettings, subject::memory::PersonMemory,
+    error::FusionError, health::stage_times::StageTimes, learner::person_learner::PersonLearner,
+    perception::observation::Perception, settings::session::SessionSettings, subject::memory::PersonMemory,
 };
 
 /// Builder of a [`Session`].
@@ -76,6 +76,7 @@ impl SessionBuilder {
     pub fn build(self) -> Result<Session, FusionError> {
         self.settings.validate()?;
         let gpu = self.gpu.fastest();
+        let learner = self.settings.body.learn.then(PersonLearner::new);
         let mut session = Session {
             view_renderer: ViewRenderer::new(&gpu, self.settings.body.gaussians)?,
             gpu,
@@ -87,6 +88,7 @@ impl SessionBuilder {
             subjects: Vec::new(),
             saved: self.saved,
             newcomers: Newcomers::default(),
+            learner,
             measuring_since: None,
             keep_observations: false,
             shape_held: false,

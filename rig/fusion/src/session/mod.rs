@@ -32,6 +32,7 @@ use flyrig_types::{Camera, Frame, FrameSet, Image, PersonId, Pose, RenderedView,
 use crate::{
     error::FusionError,
     health::stage_times::StageTimes,
+    learner::person_learner::PersonLearner,
     perception::observation::{Perception, PersonObservation, SeenPerson, ViewObservation},
     settings::{effort::Effort, session::SessionSettings},
     subject::{
@@ -65,6 +66,8 @@ pub struct Session {
     /// Memories of people who are not subjects yet.
     saved: BTreeMap<PersonId, PersonMemory>,
     newcomers: Newcomers,
+    /// Learner of the first person, with `body.learn`.
+    learner: Option<PersonLearner>,
     /// Time since which a person is seen who cannot be shown yet.
     measuring_since: Option<Instant>,
     keep_observations: bool,
@@ -271,6 +274,12 @@ impl Session {
     pub fn use_threads(&mut self) {
         self.newcomers.use_threads();
         self.perceiver.use_threads();
+        self.learner.iter_mut().for_each(PersonLearner::use_threads);
+    }
+
+    /// Chooses how many steps of learning follow a frame set where they are not done in a thread.
+    pub fn set_learning_steps(&mut self, steps: u32) {
+        self.learner.iter_mut().for_each(|learner| learner.steps_per_set = steps);
     }
 
     /// Creates subjects for people who have none yet, and for those whose shape has changed.
@@ -305,9 +314,14 @@ impl Session {
 
     /// Updates one person from a frame set.
     fn update(&mut self, set: &FrameSet, seen: &SeenPerson, effort: Effort) -> Result<(), FusionError> {
+        let is_first = self.subjects.first().is_some_and(|subject| subject.id() == seen.person);
         let Some(subject) = self.subjects.iter_mut().find(|subject| subject.id() == seen.person) else {
             return Err(FusionError::NoSuchPerson(seen.person));
         };
+        if let Some(learner) = self.learner.as_mut().filter(|_| is_first) {
+            learner.hold(effort != Effort::FULL);
+            learner.advance(subject, &self.gpu, &mut self.stages)?;
+        }
         let pose = &seen.pose;
         subject.track.curve.push(set.master_nanos, pose);
         subject.check_up(pose, self.rig.world_up);
@@ -318,7 +332,13 @@ impl Session {
             subject.track.watch.leave(set.master_nanos);
         } else {
             match subject.track.watch.arrive(set.master_nanos, pose) {
-                Remedy::Forget => subject.forget(&self.gpu)?,
+                Remedy::Forget => {
+                    if let Some(learner) = self.learner.as_mut().filter(|_| is_first) {
+                        learner.forget();
+                        subject.return_to_start(&self.gpu)?;
+                    }
+                    subject.forget(&self.gpu)?;
+                }
                 Remedy::Restart => subject.restart(),
                 Remedy::None => {}
             }
@@ -338,6 +358,15 @@ impl Session {
             let ids = views.iter().map(|view| view.camera.id.clone());
             let agreement = ids.zip(subject.agreement()).filter_map(|(id, quality)| Some((id, quality?)));
             subject.track.watch.assess(agreement);
+        }
+        if let Some(learner) = self.learner.as_mut().filter(|_| is_first) {
+            learner.see(
+                subject,
+                (set.master_nanos, pose, &views),
+                &self.gpu,
+                (&self.rig, &self.settings),
+                &mut self.stages,
+            )?;
         }
         self.counts.poisoned += u64::from(subject.deform_report().is_some_and(|report| report.poisoned));
         subject.track.last_pose = Some(seen.pose.clone());
@@ -458,6 +487,7 @@ impl Session {
             subjects.push(subject);
         }
         self.newcomers.clear();
+        self.learner.iter_mut().for_each(PersonLearner::forget);
         (self.gpu, self.view_renderer, self.subjects) = (gpu, view_renderer, subjects);
         Ok(())
     }

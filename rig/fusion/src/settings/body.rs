@@ -31,6 +31,9 @@ pub struct BodySettings {
     /// File of the first person's avatar: tracking and colours start from it; empty: none.
     #[arg(skip)]
     pub avatar: PathBuf,
+    /// Learn the person while the rig runs: an avatar is fitted to the past, and used where it shows views better.
+    #[arg(long)]
+    pub learn: bool,
 }
 
 impl Default for BodySettings {
@@ -41,6 +44,7 @@ impl Default for BodySettings {
             nodes: DEFAULT_NODE_COUNT,
             person: PathBuf::new(),
             avatar: PathBuf::new(),
+            learn: false,
         }
     }
 }

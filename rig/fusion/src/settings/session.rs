@@ -44,6 +44,11 @@ impl SessionSettings {
         self.perception.validate()?;
         self.body.validate()?;
         self.tracking.validate()?;
+        if self.body.learn && self.appearance.mode.is_learned() {
+            return Err(FusionError::Setting(
+                "body.learn needs appearance.mode = \"direct\": networks do not paint an avatar".to_owned(),
+            ));
+        }
         self.budget.validate()
     }
 }

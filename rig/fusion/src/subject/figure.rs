@@ -2,7 +2,7 @@
 
 use std::sync::Arc;
 
-use flyrig_avatar::{Avatar, Bones, PosedAvatar};
+use flyrig_avatar::{Avatar, Bones, GaussianParameters, PosedAvatar};
 use flyrig_body::{DeformationGraph, Skeleton, SurfaceGaussians};
 use flyrig_gpu::{GpuContext, StorageBuffer};
 use flyrig_renderer::{AnisotropicBuffers, Corrected, GaussianBuffers, Recolor};
@@ -18,6 +18,8 @@ pub(super) struct AvatarFigure {
     source: Arc<Avatar>,
     /// The avatar, hung on the session's graph.
     avatar: Avatar,
+    /// Attributes that the avatar changes to, and the updates until it has them.
+    change: Option<(GaussianParameters, u32)>,
     canonical: Vec<[f32; 4]>,
     posed: PosedAvatar,
     recolor: Recolor,
@@ -61,6 +63,7 @@ impl AvatarFigure {
             },
             source: Arc::clone(source),
             avatar,
+            change: None,
             canonical,
             posed: PosedAvatar::default(),
             look: StorageBuffer::from_slice(gpu, "looks of the surface", &looks)?,
@@ -71,6 +74,38 @@ impl AvatarFigure {
     /// Returns the avatar as it was given.
     pub fn source(&self) -> &Arc<Avatar> {
         &self.source
+    }
+
+    /// Changes to another version of the avatar, on the same graph, over `sets` updates. The colours that the deformation compares, and
+    /// the light, change at once.
+    pub fn change_to(
+        &mut self,
+        gpu: &GpuContext,
+        source: &Arc<Avatar>,
+        surface: &SurfaceGaussians,
+        gaussians: &GaussianBuffers,
+        sets: u32,
+    ) {
+        let looks: Vec<[f32; 4]> = source.surface_colors(surface).into_iter().map(|[r, g, b]| [r, g, b, 1.0]).collect();
+        self.look.write(gpu, &looks);
+        self.canonical = source.centers().iter().map(|p| p.extend(1.0).to_array()).collect();
+        gaussians.canonical.write(gpu, &self.canonical);
+        for surface in self.instants.iter().filter_map(|instant| instant.drawn.surface.as_ref()) {
+            surface.canonical.write(gpu, &self.canonical);
+        }
+        let before = std::mem::replace(&mut self.avatar, (**source).clone());
+        self.change = Some((std::mem::replace(&mut self.avatar.parameters, before.parameters), sets.max(1)));
+        self.source = Arc::clone(source);
+    }
+
+    /// Goes on with a change of version by one update.
+    fn go_on(&mut self) {
+        let Some((target, left)) = &mut self.change else { return };
+        self.avatar.parameters.approach(target, 1.0 / *left as f32);
+        *left -= 1;
+        if *left == 0 {
+            self.change = None;
+        }
     }
 
     /// Returns the mean translations of the graph's nodes, canonical metres.
@@ -112,6 +147,9 @@ impl AvatarFigure {
             }
             let constant = StorageBuffer::zeroed(gpu, "constant harmonics", count)?;
             self.instants.push(Instant { drawn, constant });
+        }
+        if instant == 0 {
+            self.go_on();
         }
         self.avatar.pose(&Bones::new(skeleton, pose), translations, &mut self.posed);
         let PosedAvatar { center, scale_opacity, rotation, harmonics, .. } = &self.posed;

@@ -18,6 +18,7 @@ use super::{
     inputs::{InputView, Inputs},
     instants::Instants,
     stage_clock::{StageClock, TimedStage},
+    surface::GraphedSurface,
 };
 use crate::{
     deformation::{
@@ -37,7 +38,10 @@ pub(super) const UNPAINTED: [f32; 4] = [0.5, 0.5, 0.5, 1.0];
 /// Gaussians of a person in the world, and the deformation that moves them beyond the pose.
 #[derive(Debug)]
 pub(super) struct Geometry {
-    figure: Figure,
+    /// Skinner of the surface's own Gaussians.
+    skinner: GpuSkinner,
+    /// Gaussians of an avatar, in their place.
+    figure: Option<Box<AvatarFigure>>,
     /// Gaussians at the frame set's time, with the colours that are shown.
     gaussians: GaussianBuffers,
     /// Gaussians at the second, third ... instant of a frame set.
@@ -47,15 +51,6 @@ pub(super) struct Geometry {
     is_held: bool,
     /// Agreement of the deformation with the views that it was solved for last; see [`Self::agreement`].
     agreement: Vec<Option<ViewAgreement>>,
-}
-
-/// Gaussians that follow the surface.
-#[derive(Debug)]
-enum Figure {
-    /// Those of the surface itself.
-    Surface(GpuSkinner),
-    /// Those of an avatar.
-    Avatar(Box<AvatarFigure>),
 }
 
 impl Geometry {
@@ -77,18 +72,14 @@ impl Geometry {
         let canonical: Vec<[f32; 4]> = surface.positions.iter().map(|p| p.extend(1.0).to_array()).collect();
         gaussians.canonical.write(gpu, &canonical);
         gaussians.color.write(gpu, &vec![UNPAINTED; count]);
-        let figure = match avatar {
-            Some(avatar) => Figure::Avatar(Box::new(AvatarFigure::new(gpu, avatar, (surface, graph), &gaussians)?)),
-            None => Figure::Surface(GpuSkinner::new(gpu, rendered, &template.skeleton)?),
-        };
-        let mean = match &figure {
-            Figure::Avatar(figure) => Some(figure.mean()),
-            Figure::Surface(_) => None,
-        };
+        let skinner = GpuSkinner::new(gpu, rendered, &template.skeleton)?;
+        let figure = avatar.map(|avatar| AvatarFigure::new(gpu, avatar, (surface, graph), &gaussians)).transpose()?;
+        let figure = figure.map(Box::new);
+        let mean = figure.as_ref().map(|figure| figure.mean());
         let deformation = (settings.tracking.options())
             .map(|options| Deformation::new(gpu, template, surface, (graph, mean), options, finest_pixel_m(rig)))
             .transpose()?;
-        Ok(Self { figure, gaussians, posed: Vec::new(), deformation, is_held: false, agreement: Vec::new() })
+        Ok(Self { skinner, figure, gaussians, posed: Vec::new(), deformation, is_held: false, agreement: Vec::new() })
     }
 
     /// Returns the Gaussians at the frame set's time.
@@ -103,32 +94,58 @@ impl Geometry {
 
     /// Returns the avatar whose Gaussians follow the surface; `None` for those of the surface itself.
     pub fn avatar(&self) -> Option<&Arc<Avatar>> {
-        match &self.figure {
-            Figure::Avatar(figure) => Some(figure.source()),
-            Figure::Surface(_) => None,
+        self.figure.as_ref().map(|figure| figure.source())
+    }
+
+    /// Makes the person of an avatar that hangs on this surface's graph. Another avatar before it changes into it over `sets` updates.
+    pub fn set_avatar(
+        &mut self,
+        gpu: &GpuContext,
+        avatar: &Arc<Avatar>,
+        base: &GraphedSurface,
+        sets: u32,
+    ) -> Result<(), FusionError> {
+        let GraphedSurface { surface, graph } = base;
+        match &mut self.figure {
+            Some(figure) => figure.change_to(gpu, avatar, surface, &self.gaussians, sets),
+            none => {
+                *none = Some(Box::new(AvatarFigure::new(gpu, avatar, (surface, graph), &self.gaussians)?));
+            }
+        }
+        match (&mut self.deformation, &self.figure) {
+            (Some(deformation), Some(figure)) => deformation.set_mean(figure.mean()),
+            _ => Ok(()),
+        }
+    }
+
+    /// Returns to the Gaussians of the surface. They keep the colours that were seen last.
+    pub fn drop_avatar(&mut self, gpu: &GpuContext, base: &GraphedSurface) -> Result<(), FusionError> {
+        if self.figure.take().is_none() {
+            return Ok(());
+        }
+        let canonical: Vec<[f32; 4]> = base.surface.positions.iter().map(|p| p.extend(1.0).to_array()).collect();
+        self.gaussians.canonical.write(gpu, &canonical);
+        match &mut self.deformation {
+            Some(deformation) => deformation.set_mean(&vec![DVec3::ZERO; base.graph.nodes.len()]),
+            None => Ok(()),
         }
     }
 
     /// Returns the Gaussians that are drawn at an instant of the last update.
     pub fn drawn(&self, instant: usize) -> Gaussians<'_> {
-        match &self.figure {
-            Figure::Avatar(figure) => figure.drawn(instant).map_or(self.at(instant).into(), Gaussians::Anisotropic),
-            Figure::Surface(_) => self.at(instant).into(),
-        }
+        let avatar = self.figure.as_ref().and_then(|figure| figure.drawn(instant));
+        avatar.map_or(self.at(instant).into(), Gaussians::Anisotropic)
     }
 
     /// Returns the Gaussians at the frame set's time with the colours that images paint: those of the surface, or corrections of an
     /// avatar's.
     pub fn painted(&self) -> &GaussianBuffers {
-        match &self.figure {
-            Figure::Avatar(figure) => figure.painted(),
-            Figure::Surface(_) => &self.gaussians,
-        }
+        self.figure.as_ref().map_or(&self.gaussians, |figure| figure.painted())
     }
 
     /// Shows what was painted.
     pub fn encode_colors(&self, gpu: &GpuContext, encoder: &mut wgpu::CommandEncoder) {
-        if let Figure::Avatar(figure) = &self.figure {
+        if let Some(figure) = &self.figure {
             figure.recolor(gpu, encoder, 0, &self.gaussians);
         }
     }
@@ -196,10 +213,7 @@ impl Geometry {
                 instant: instants.of_view(i),
             })
             .collect();
-        let colors = match &self.figure {
-            Figure::Avatar(figure) => figure.looks(),
-            Figure::Surface(_) => &self.gaussians.color,
-        };
+        let colors = self.figure.as_ref().map_or(&self.gaussians.color, |figure| figure.looks());
         let person = TrackedPerson { gpu, skeleton, poses: instants.poses(), colors };
         let times = deformation.track(person, &tracked)?;
         self.agreement.extend_from_slice(deformation.agreement());
@@ -227,16 +241,13 @@ impl Geometry {
             }
             let gaussians = if i == 0 { &self.gaussians } else { &self.posed[i - 1] };
             let deformation = self.deformation.as_ref();
-            match &mut self.figure {
-                Figure::Surface(skinner) => {
-                    let (centers, normals) = (&gaussians.center_scale, &gaussians.normal);
-                    let displacement = deformation.map(Deformation::displacement);
-                    skinner.encode(gpu, &mut encoder, skeleton, pose, displacement, centers, normals)?;
-                }
-                Figure::Avatar(figure) => {
-                    let translations = deformation.map(Deformation::translations);
-                    figure.pose(gpu, &mut encoder, i, (skeleton, pose), translations, gaussians)?;
-                }
+            if let Some(figure) = &mut self.figure {
+                let translations = deformation.map(Deformation::translations);
+                figure.pose(gpu, &mut encoder, i, (skeleton, pose), translations, gaussians)?;
+            } else {
+                let (centers, normals) = (&gaussians.center_scale, &gaussians.normal);
+                let displacement = deformation.map(Deformation::displacement);
+                self.skinner.encode(gpu, &mut encoder, skeleton, pose, displacement, centers, normals)?;
             }
             if i + 1 == instants.poses().len() {
                 clock.mark(&mut encoder, TimedStage::Skinning);

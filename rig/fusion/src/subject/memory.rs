@@ -110,6 +110,12 @@ impl PersonMemory {
         self.stream.take()
     }
 
+    /// Returns the avatar that the person is made of; `None` for one made of the surface.
+    #[must_use]
+    pub fn avatar(&self) -> Option<&Arc<Avatar>> {
+        self.avatar.as_ref()
+    }
+
     /// Returns the person's clothes.
     #[must_use]
     pub fn outfit(&self) -> Outfit {

@@ -1,7 +1,8 @@
 //! Files of [`PersonMemory`]: safetensors, with names and numbers that are no tensors in the metadata.
 
-use std::{collections::HashMap, io::Write as _, path::Path};
+use std::{collections::HashMap, io::Write as _, path::Path, sync::Arc};
 
+use flyrig_avatar::Avatar;
 use flyrig_body::{Joint, Outfit, Shoes, Skirt};
 use flyrig_stfa::FeatureMemory;
 use glam::{DMat4, DQuat, DVec3, Vec3};
@@ -18,6 +19,8 @@ const VERSION_KEY: &str = "flyrig-person";
 const JOINTS_KEY: &str = "joints";
 /// Key of the digest of the networks' weights, hexadecimal, where a memory of networks is saved.
 const NETWORKS_KEY: &str = "networks";
+/// Tensor with the bytes of the avatar's file, where the person is made of one.
+const AVATAR: &str = "avatar";
 /// Key of a skirt's length and flare, where the person wears one.
 const SKIRT_KEY: &str = "skirt";
 /// Key of the soles' thickness in metres, where the person wears shoes.
@@ -29,13 +32,14 @@ impl PersonMemory {
     /// Writes a file, completely or not at all.
     ///
     /// # Errors
-    /// [`FusionError::SavedPerson`] with the system's reason, and for a person made of an avatar.
+    /// [`FusionError::SavedPerson`] with the system's reason.
     pub fn save(&self, path: &Path) -> Result<(), FusionError> {
         let fail = |problem: String| fault(&path.display().to_string(), problem);
-        if self.avatar.is_some() {
-            return Err(fail("is made of an avatar, which has a file of its own; name that as body.avatar".to_owned()));
+        let mut tensors = self.tensors();
+        if let Some(avatar) = &self.avatar {
+            let bytes = avatar.to_bytes().map_err(|error| fail(error.to_string()))?;
+            tensors.push((AVATAR, Dtype::U8, vec![bytes.len()], bytes));
         }
-        let tensors = self.tensors();
         let views: Vec<(&str, TensorView<'_>)> = tensors
             .iter()
             .map(|(name, dtype, shape, data)| Ok((*name, TensorView::new(*dtype, shape.clone(), data)?)))
@@ -76,7 +80,7 @@ impl PersonMemory {
             networks: reader.networks()?,
             is_start: false,
             stream: None,
-            avatar: None,
+            avatar: reader.avatar()?.map(Arc::new),
         })
     }
 
@@ -210,6 +214,12 @@ impl<'a> MemoryReader<'a> {
         let memory = FeatureMemory::from_parts(width, weights, features)
             .ok_or_else(|| self.damaged("the networks' memory does not fit itself"))?;
         Ok(Some(NetworkMemory { digest, memory }))
+    }
+
+    /// Returns the avatar that the person is made of; `None` where none was saved.
+    fn avatar(&self) -> Result<Option<Avatar>, FusionError> {
+        let Ok(view) = self.tensors.tensor(AVATAR) else { return Ok(None) };
+        Avatar::from_bytes(view.data()).map(Some).map_err(|problem| self.damaged(&format!("its avatar: {problem}")))
     }
 
     fn outfit(&self) -> Result<Outfit, FusionError> {

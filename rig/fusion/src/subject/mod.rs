@@ -12,11 +12,12 @@ mod memory_file;
 mod painter;
 pub(crate) mod person;
 mod pose_curve;
+mod rehearsal;
 mod resume;
 mod schedule;
 mod stage_clock;
 pub(crate) mod stream_frame;
-mod surface;
+pub(crate) mod surface;
 pub(crate) mod track_watch;
 pub(crate) mod upright;
 

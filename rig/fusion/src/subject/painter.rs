@@ -159,6 +159,12 @@ impl GaussianPainter {
         }
     }
 
+    /// Paints corrections of an avatar's colours from now on, or the colours of the surface.
+    pub fn correct(&mut self, corrects: bool) {
+        self.direct_mut().settings.corrects = corrects;
+        self.reset();
+    }
+
     /// Forgets all colours that were seen.
     pub fn reset(&mut self) {
         self.direct_mut().appearance.reset();

@@ -33,7 +33,7 @@ use super::{
     schedule::Schedule,
     stage_clock::StageClock,
     stream_frame::{PersonFrame, encode_template, motion},
-    surface::person_surface,
+    surface::{GraphedSurface, person_surface},
     track_watch::TrackWatch,
     upright::Upright,
 };
@@ -101,13 +101,15 @@ pub struct Subject {
     /// Number of the shape, see [`crate::KnownPerson`].
     pub(crate) shape_number: u32,
     pub(super) shape: PersonShape,
+    /// Surface and its graph, where the person is learnt.
+    pub(super) base: Option<Arc<GraphedSurface>>,
     /// Deformation graph as the networks see it.
     body_graph: BodyGraph,
-    inputs: Inputs,
+    pub(super) inputs: Inputs,
     pub(super) geometry: Geometry,
     pub(super) painter: GaussianPainter,
     pub(super) schedule: Schedule,
-    clock: StageClock,
+    pub(super) clock: StageClock,
     /// Shape and colours that the person starts with, where they are known before the first image.
     pub(super) start: Option<Arc<PersonMemory>>,
     pub(crate) track: PersonTrack,
@@ -124,28 +126,44 @@ impl Subject {
     ) -> Result<Self, FusionError> {
         let template = outfit.on(&body)?;
         let avatar = avatar.filter(|avatar| is_of(avatar, &template));
-        let (surface, graph) = match avatar {
+        let base = match avatar {
             Some(avatar) => {
                 let surface = avatar.attached_surface()?;
                 let nodes = avatar.hanging.as_ref().map_or(settings.body.nodes, |hanging| hanging.nodes.len());
                 let graph = build_graph(&template, &surface, nodes, DEFAULT_SIGMA2_M2)?;
-                (surface, graph)
+                GraphedSurface { surface, graph }
             }
-            None => person_surface(&template, &settings.body)?,
+            None => {
+                let (surface, graph) = person_surface(&template, &settings.body)?;
+                GraphedSurface { surface, graph }
+            }
         };
+        Self::of_surface(gpu, id, (body, outfit), (Arc::new(base), avatar), (rig, settings))
+    }
+
+    /// Creates a person with this surface, which is that of the dressed body.
+    pub(crate) fn of_surface(
+        gpu: &GpuContext,
+        id: PersonId,
+        (body, outfit): (Template, Outfit),
+        (base, avatar): (Arc<GraphedSurface>, Option<&Arc<Avatar>>),
+        (rig, settings): (&Rig, &SessionSettings),
+    ) -> Result<Self, FusionError> {
+        let template = outfit.on(&body)?;
+        let GraphedSurface { surface, graph } = &*base;
         let is_deformed = settings.tracking.options().is_some();
         let inset = is_deformed.then(|| surface.inset());
-        let rendered = inset.as_ref().unwrap_or(&surface);
-        let stream = encode_template(rendered, is_deformed.then_some(&graph), &template.skeleton)?;
-        let body_graph = BodyGraph::new(&surface, &graph)?;
+        let rendered = inset.as_ref().unwrap_or(surface);
+        let stream = encode_template(rendered, is_deformed.then_some(graph), &template.skeleton)?;
+        let body_graph = BodyGraph::new(surface, graph)?;
         Ok(Self {
             id,
             shape_number: 0,
-            geometry: Geometry::new(gpu, &template, (&surface, rendered), &graph, avatar, (rig, settings))?,
+            geometry: Geometry::new(gpu, &template, (surface, rendered), graph, avatar, (rig, settings))?,
             painter: GaussianPainter::new(
                 gpu,
-                &surface,
-                &graph,
+                surface,
+                graph,
                 &body_graph,
                 (rig.cameras.len(), avatar.is_some()),
                 settings,
@@ -155,6 +173,7 @@ impl Subject {
                 undressed: (!outfit.is_bare()).then_some((body, outfit)),
                 stream: Arc::new(stream),
             },
+            base: settings.body.learn.then_some(base),
             body_graph,
             inputs: Inputs::default(),
             schedule: Schedule::default(),
@@ -213,6 +232,11 @@ impl Subject {
     #[must_use]
     pub fn template(&self) -> &Template {
         &self.shape.template
+    }
+
+    /// Returns the surface with its graph; `None` where the person is not learnt.
+    pub(crate) fn base(&self) -> Option<&Arc<GraphedSurface>> {
+        self.base.as_ref()
     }
 
     /// Returns the body without its clothes.

@@ -9,6 +9,13 @@ use crate::settings::body::BodySettings;
 /// Seed of the surface sampling: equal templates give equal Gaussians in every run.
 const SURFACE_SEED: u64 = 1;
 
+/// Surface of a person, and the graph that deforms it.
+#[derive(Debug)]
+pub(crate) struct GraphedSurface {
+    pub surface: SurfaceGaussians,
+    pub graph: DeformationGraph,
+}
+
 /// Samples the Gaussians of a session's person on the surface of its template.
 ///
 /// # Errors

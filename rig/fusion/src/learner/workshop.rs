@@ -1,0 +1,277 @@
+//! Fit of an avatar to key sets, in rounds.
+
+use std::{
+    collections::BTreeMap,
+    sync::{Arc, atomic::AtomicBool},
+};
+
+use flyrig_avatar::{Avatar, AvatarFitSettings, AvatarModel, KnownPoses, TrainingFrame};
+use flyrig_body::Template;
+use flyrig_fit::{Fit, FitSettings, TrainingView};
+use flyrig_gpu::GpuContext;
+use flyrig_renderer::HarmonicOrder;
+use flyrig_types::{CameraId, Rig};
+
+use super::{
+    judge::{Compared, Judge},
+    key_sets::{Choice, KeySet, is_held_back},
+};
+use crate::{error::FusionError, settings::session::SessionSettings, subject::surface::GraphedSurface};
+
+/// Steps of a round in which a camera is left out, and of one with all cameras.
+const TRIAL_STEPS: u32 = 200;
+const ROUND_STEPS: u32 = 300;
+/// Share of a fit's course at which later rounds begin: their rates are lower.
+const LATER: f32 = 0.4;
+/// Least number of cameras of which one is left out of the first rounds.
+const LEAST_CAMERAS: usize = 3;
+/// Least number of key sets of the first round: to fit to, and held back.
+const LEAST_FITTED: usize = 6;
+const LEAST_HELD_BACK: usize = 2;
+/// New key sets that start a round after one without success.
+const FRESH: usize = 4;
+/// Newer held-back key sets of a pose that was known after which the version in use is compared again.
+const UNCHECKED: usize = 2;
+/// Growth of the error in use from which a round begins.
+const WORSE: f64 = 1.1;
+/// Share of the error in use below which a version is adopted.
+const BETTER: f64 = 0.99;
+
+/// Start of a workshop.
+#[derive(Debug)]
+pub(crate) struct Beginning {
+    pub gpu: GpuContext,
+    pub rig: Rig,
+    pub settings: SessionSettings,
+    pub template: Template,
+    pub base: Arc<GraphedSurface>,
+    /// Linear RGB of each Gaussian as it is drawn now.
+    pub colors: Vec<[f32; 3]>,
+    /// Avatar that the person is made of already.
+    pub in_use: Option<Arc<Avatar>>,
+    /// Set when comparisons are to end early.
+    pub stopped: Arc<AtomicBool>,
+}
+
+/// Result of a round.
+#[derive(Debug, Clone)]
+pub(crate) struct Verdict {
+    /// Change of the person.
+    pub change: Change,
+    pub round: u32,
+    /// Key sets that it was fitted to.
+    pub fitted: usize,
+    /// Error on the key sets that were held back, of the person in use and of the new version.
+    pub errors: [f64; 2],
+}
+
+/// Change of the person after a round.
+#[derive(Debug, Clone)]
+pub(crate) enum Change {
+    /// The version in use is better.
+    Keep,
+    /// The new version is better in a camera that it was not fitted to; the next round fits it to all cameras.
+    Prove,
+    /// The person becomes this avatar.
+    Adopt(Arc<Avatar>),
+    /// The avatar in use does not fit the person any more.
+    Drop,
+}
+
+/// Fit of one person's avatar.
+#[derive(Debug)]
+pub(crate) struct Workshop {
+    gpu: GpuContext,
+    avatar: Avatar,
+    in_use: Option<Arc<Avatar>>,
+    judge: Judge,
+    /// Key sets by slot.
+    sets: BTreeMap<usize, (u64, KeySet)>,
+    /// Number of key sets that came so far.
+    came: u64,
+    fit: Option<Fit<AvatarModel>>,
+    steps: u32,
+    rounds: u32,
+    /// Key sets that came since the last round began and show something new.
+    fresh: usize,
+    /// Held-back key sets that came since the last comparison and show what is known.
+    unchecked: usize,
+    /// Error of the version in use when it was adopted.
+    error_in_use: f64,
+    /// Whether the last round was a success.
+    succeeded: bool,
+    /// Whether a version was better in a camera that it was not fitted to.
+    proven: bool,
+    /// Cameras of the rig.
+    cameras: Vec<CameraId>,
+}
+
+impl Workshop {
+    /// Starts from the person as it is.
+    pub fn new(beginning: Beginning) -> Result<Self, FusionError> {
+        let Beginning { gpu, rig, settings, template, base, colors, in_use, stopped } = beginning;
+        let in_use_is_known = in_use.is_some();
+        let avatar = match &in_use {
+            Some(avatar) => avatar.hung_on(&base.graph),
+            None => {
+                let surface = base.surface.inset();
+                Avatar::new(&template, &surface, Some(&base.graph), &colors, HarmonicOrder::Zero)?
+            }
+        };
+        let cameras = rig.cameras.iter().map(|camera| camera.id.clone()).collect();
+        let judge = Judge::new(&gpu, (template, base), (&rig, &settings), stopped)?;
+        Ok(Self {
+            gpu,
+            avatar,
+            in_use,
+            judge,
+            sets: BTreeMap::new(),
+            came: 0,
+            fit: None,
+            steps: 0,
+            rounds: 0,
+            fresh: 0,
+            unchecked: 0,
+            error_in_use: f64::INFINITY,
+            succeeded: true,
+            proven: in_use_is_known,
+            cameras,
+        })
+    }
+
+    /// Adds a key set, or replaces the one in its slot.
+    pub fn add(&mut self, set: KeySet) {
+        self.came += 1;
+        let Choice { slot, is_new } = set.choice;
+        self.fresh += usize::from(is_new);
+        self.unchecked += usize::from(!is_new && is_held_back(slot));
+        self.sets.insert(slot, (self.came, set));
+    }
+
+    /// Returns whether [`Self::work`] has anything to do.
+    pub fn is_busy(&self) -> bool {
+        let held = self.sets.keys().filter(|slot| is_held_back(**slot)).count();
+        let is_due = self.succeeded || self.fresh >= FRESH;
+        self.fit.is_some()
+            || self.is_check_due()
+            || is_due && held >= LEAST_HELD_BACK && self.sets.len() - held >= LEAST_FITTED
+    }
+
+    /// Returns whether the version in use may not fit the person any more.
+    fn is_check_due(&self) -> bool {
+        self.in_use.is_some() && self.unchecked >= UNCHECKED
+    }
+
+    /// Begins a round, descends by one step, or ends the round with a comparison, which is returned. Between rounds, compares the version
+    /// in use with newer images.
+    pub fn work(&mut self) -> Result<Option<Verdict>, FusionError> {
+        let Some(fit) = &mut self.fit else {
+            if self.is_check_due() {
+                return self.check();
+            }
+            if self.is_busy() {
+                self.begin()?;
+            }
+            return Ok(None);
+        };
+        let (start, steps) = if self.proven { (LATER, ROUND_STEPS) } else { (0.0, TRIAL_STEPS) };
+        if self.steps < steps {
+            fit.step(start + (1.0 - start) * self.steps as f32 / steps as f32)?;
+            self.steps += 1;
+            return Ok(None);
+        }
+        let Some(fit) = self.fit.take() else { return Ok(None) };
+        self.avatar = fit.into_model().into_avatar();
+        self.compare().map(Some)
+    }
+
+    /// Returns the camera of this round's comparison; without a version that was proven, it is left out of the fit.
+    fn compared_camera(&self) -> Option<&CameraId> {
+        self.cameras.get(self.rounds as usize % self.cameras.len().max(1))
+    }
+
+    /// Begins a round with the key sets that are not held back.
+    fn begin(&mut self) -> Result<(), FusionError> {
+        self.rounds += 1;
+        let is_trial = !self.proven && self.cameras.len() >= LEAST_CAMERAS;
+        let left_out = self.compared_camera().filter(|_| is_trial);
+        let (mut frames, mut views) = (Vec::new(), Vec::<TrainingView>::new());
+        for (_, set) in self.sets.values().filter(|(_, set)| !is_held_back(set.choice.slot)) {
+            let frame = |pose| TrainingFrame { pose, translations: set.translations.clone() };
+            let at_set = frames.len();
+            frames.push(frame(set.pose.clone()));
+            for view in set.views.iter().filter(|view| left_out != Some(&view.crop.camera().id)) {
+                let own = view.pose.as_ref().map(|pose| {
+                    frames.push(frame(pose.clone()));
+                    frames.len() - 1
+                });
+                views.push(view.crop.clone().of_frame(own.unwrap_or(at_set)));
+            }
+        }
+        let mut avatar = self.avatar.clone();
+        avatar.set_mean(frames.iter().map(|frame| frame.translations.as_slice()));
+        avatar.known_poses = KnownPoses::new(&frames.iter().map(|frame| frame.pose.clone()).collect::<Vec<_>>());
+        let model = AvatarModel::new(avatar, frames, AvatarFitSettings::default());
+        let settings = FitSettings { seed: u64::from(self.rounds), ..FitSettings::default() };
+        self.fit = Some(Fit::new(&self.gpu, model, views, settings)?);
+        (self.steps, self.fresh) = (0, 0);
+        Ok(())
+    }
+
+    /// Compares the version in use with the surface on the newest key sets that were held back. Returns a verdict if it does not fit the
+    /// person any more; a round begins if it fits worse than it did.
+    fn check(&mut self) -> Result<Option<Verdict>, FusionError> {
+        self.unchecked = 0;
+        let (Some(avatar), Some(camera)) = (self.in_use.clone(), self.compared_camera().cloned()) else {
+            return Ok(None);
+        };
+        let sets = Compared::of(&self.sets);
+        let surface = self.judge.error(None, &sets, &camera)?;
+        let in_use = self.judge.error(Some(&avatar), &sets, &camera)?;
+        let (Some(surface), Some(in_use)) = (surface, in_use) else { return Ok(None) };
+        if surface < BETTER * in_use {
+            self.in_use = None;
+            let (round, fitted) = (self.rounds, sets.seen.len());
+            return Ok(Some(Verdict { round, fitted, errors: [in_use, surface], change: Change::Drop }));
+        }
+        if in_use > WORSE * self.error_in_use {
+            self.succeeded = true;
+        }
+        Ok(None)
+    }
+
+    /// Compares the fitted avatar with the person in use, on the newest key sets that were held back.
+    fn compare(&mut self) -> Result<Verdict, FusionError> {
+        self.unchecked = 0;
+        let new = Arc::new(self.avatar.clone());
+        self.succeeded = false;
+        let Some(camera) = self.compared_camera().cloned() else { return Ok(self.undecided()) };
+        let sets = Compared::of(&self.sets);
+        let mut error = |avatar| self.judge.error(avatar, &sets, &camera);
+        let (surface, found) = (error(None)?, error(Some(&new))?);
+        let old = self.in_use.as_ref().map(|avatar| error(Some(avatar))).transpose()?.flatten();
+        let (Some(surface), Some(found)) = (surface, found) else { return Ok(self.undecided()) };
+        let in_use = old.unwrap_or(surface);
+        let change = if found < BETTER * in_use.min(surface) {
+            if self.proven { Change::Adopt(new) } else { Change::Prove }
+        } else if old.is_some_and(|old| surface < BETTER * old) {
+            Change::Drop
+        } else {
+            Change::Keep
+        };
+        let verdict = Verdict { round: self.rounds, fitted: sets.seen.len(), errors: [in_use, found], change };
+        self.succeeded = matches!(verdict.change, Change::Adopt(_) | Change::Prove);
+        self.proven |= self.succeeded;
+        match &verdict.change {
+            Change::Adopt(avatar) => (self.in_use, self.error_in_use) = (Some(Arc::clone(avatar)), found),
+            Change::Drop => self.in_use = None,
+            Change::Keep | Change::Prove => {}
+        }
+        Ok(verdict)
+    }
+
+    /// Returns the result of a round whose camera has no view in the key sets that were held back.
+    fn undecided(&self) -> Verdict {
+        Verdict { change: Change::Keep, round: self.rounds, fitted: 0, errors: [f64::NAN; 2] }
+    }
+}
