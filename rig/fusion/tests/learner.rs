@@ -76,11 +76,18 @@ fn learning() -> SessionSettings {
     settings
 }
 
-fn session(gpu: GpuContext, settings: SessionSettings) -> Session {
+/// Returns a session that follows the person, and resumes it from a memory.
+fn session(gpu: GpuContext, settings: SessionSettings, memory: Option<PersonMemory>) -> Session {
     let keys = (0..=TURN).map(|index| (index * support::PERIOD_NANOS, pose(index))).collect();
-    let person = GivenPerson { person: ME, template: template(), track: PoseTrack::new(keys).unwrap(), repeat: true };
-    let perception = GivenPerception::new(&rig(), vec![person]);
-    SessionBuilder::new(gpu, rig()).settings(settings).perception(perception).build().unwrap()
+    let track = PoseTrack::new(keys).unwrap();
+    let person = GivenPerson { person: ME, template: template(), track, repeat: true };
+    // Without a search for clothes, which would change the surface.
+    let perception = GivenPerception::new(&rig(), vec![person]).dressed();
+    let builder = SessionBuilder::new(gpu, rig()).settings(settings).perception(perception);
+    match memory {
+        Some(memory) => builder.person(ME, memory).build().unwrap(),
+        None => builder.build().unwrap(),
+    }
 }
 
 /// Shows a person to a session in frame sets `from..to`, and returns the mean difference to a camera between the others in the last ten.
@@ -107,10 +114,9 @@ fn count(session: &Session, name: &str) -> u64 {
 fn a_learnt_person_is_seen_better_by_another_camera_and_reruns_are_identical() {
     let avatar = truth([[0.5, 0.05, 0.03], [0.05, 0.1, 0.5]]);
     let run = |settings: SessionSettings| {
-        let mut session = session(gpu(), settings);
+        let mut session = session(gpu(), settings, None);
         session.set_learning_steps(25);
         let error = show(&mut session, &avatar, 0, 160);
-        eprintln!("error {error}");
         (error, session)
     };
     let (without, _) = run(settings(4000));
@@ -128,19 +134,17 @@ fn a_learnt_person_is_seen_better_by_another_camera_and_reruns_are_identical() {
     let path = folder.path().join("me.person");
     memory.save(&path).unwrap();
     let loaded = PersonMemory::load(&path).unwrap();
-    let keys = (0..=TURN).map(|index| (index * support::PERIOD_NANOS, pose(index))).collect();
-    let person = GivenPerson { person: ME, template: template(), track: PoseTrack::new(keys).unwrap(), repeat: true };
-    let perception = GivenPerception::new(&rig(), vec![person]);
-    let builder = SessionBuilder::new(gpu(), rig()).settings(learning()).perception(perception);
-    let mut resumed = builder.person(ME, loaded).build().unwrap();
+    let mut resumed = session(gpu(), learning(), Some(loaded));
     let error = show(&mut resumed, &avatar, 0, 15);
-    assert!(error < 0.85 * without, "{error} after it was resumed, {without} without learning");
+    let unlearnt = show(&mut session(gpu(), settings(4000), None), &avatar, 0, 15);
+    assert!(resumed.memory(ME).unwrap().avatar().is_some());
+    assert!(error < 0.8 * unlearnt, "{error} after it was resumed, {unlearnt} without learning");
 }
 
 #[test]
 fn other_clothes_are_noticed_and_learnt_anew() {
     let (before, after) = (truth([[0.5, 0.05, 0.03], [0.05, 0.1, 0.5]]), truth([[0.02, 0.4, 0.05], [0.6, 0.5, 0.02]]));
-    let mut session = session(gpu(), learning());
+    let mut session = session(gpu(), learning(), None);
     session.set_learning_steps(25);
     show(&mut session, &before, 0, 90);
     assert!(count(&session, "versions of the person adopted") > 0);
@@ -155,7 +159,7 @@ fn other_clothes_are_noticed_and_learnt_anew() {
 #[test]
 fn a_person_who_leaves_for_long_is_forgotten_and_a_thread_ends_with_its_session() {
     let avatar = truth([[0.5, 0.05, 0.03], [0.05, 0.1, 0.5]]);
-    let mut session = session(gpu(), learning());
+    let mut session = session(gpu(), learning(), None);
     session.set_learning_steps(25);
     show(&mut session, &avatar, 0, 90);
     let empty = (vec![90; (SIZE * SIZE * 3) as usize], vec![0; (SIZE * SIZE) as usize]);
@@ -166,7 +170,7 @@ fn a_person_who_leaves_for_long_is_forgotten_and_a_thread_ends_with_its_session(
     show(&mut session, &avatar, 125, 136);
     assert!(session.memory(ME).unwrap().avatar().is_none(), "another person may have come");
 
-    let mut beside = self::session(gpu(), learning());
+    let mut beside = self::session(gpu(), learning(), None);
     beside.use_threads();
     show(&mut beside, &avatar, 0, 40);
     std::thread::sleep(Duration::from_millis(300));
@@ -175,7 +179,7 @@ fn a_person_who_leaves_for_long_is_forgotten_and_a_thread_ends_with_its_session(
 
 #[test]
 fn nothing_is_learnt_from_empty_images_and_networks_exclude_learning() {
-    let mut session = session(gpu(), learning());
+    let mut session = session(gpu(), learning(), None);
     session.set_learning_steps(25);
     let empty = (vec![90; (SIZE * SIZE * 3) as usize], vec![0; (SIZE * SIZE) as usize]);
     let sets: Vec<FrameSet> = (0..40).map(|index| frame_set(index, &vec![empty.clone(); 4])).collect();
