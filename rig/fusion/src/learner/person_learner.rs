@@ -1,6 +1,6 @@
 //! Learning of a session's first person.
 
-use std::{collections::VecDeque, sync::Arc};
+use std::sync::Arc;
 
 use flyrig_fit::TrainingView;
 use flyrig_gpu::GpuContext;
@@ -153,29 +153,33 @@ impl PersonLearner {
         gpu: &GpuContext,
         stages: &mut StageTimes,
     ) -> Result<(), FusionError> {
-        let mut verdicts = VecDeque::new();
+        let (mut verdicts, mut problem) = (Vec::new(), None);
         match &mut self.place {
             Place::Here(workshop) => {
                 for _ in 0..self.steps_per_set {
-                    if !workshop.is_busy() {
+                    if !workshop.is_busy() || problem.is_some() {
                         break;
                     }
-                    verdicts.extend(stages.time("learning", || workshop.work())?);
+                    match stages.time("learning", || workshop.work()) {
+                        Ok(verdict) => verdicts.extend(verdict),
+                        Err(error) if error.is_device_fault() => return Err(error),
+                        Err(error) => problem = Some(error.to_string()),
+                    }
                 }
             }
             Place::Beside(thread) => {
                 while let Some(verdict) = thread.verdict() {
                     match verdict {
-                        Ok(verdict) => verdicts.push_back(verdict),
-                        Err(problem) => {
-                            tracing::warn!("the person is not learnt any more: {problem}");
-                            self.place = Place::Failed;
-                            break;
-                        }
+                        Ok(verdict) => verdicts.push(verdict),
+                        Err(text) => problem = Some(text),
                     }
                 }
             }
             Place::Nowhere | Place::Failed => {}
+        }
+        if let Some(problem) = problem {
+            tracing::warn!("the person is not learnt any more: {problem}");
+            self.place = Place::Failed;
         }
         if self.of != Some((subject.id(), subject.shape_number)) {
             return Ok(());
