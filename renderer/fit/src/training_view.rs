@@ -1,5 +1,7 @@
 //! Images of a take, cropped to the person.
 
+use std::sync::Arc;
+
 use flyrig_types::Camera;
 
 use crate::image_error::Photograph;
@@ -10,15 +12,15 @@ const MARGIN_PX: u32 = 12;
 /// Divisor of the sides of crops, pixels: buffers are allocated for each size, so few sizes are wanted.
 const SIDE_PX: u32 = 64;
 
-/// Image cropped to the person.
+/// Image cropped to the person. Copies share its pixels.
 #[derive(Debug, Clone)]
 pub struct TrainingView {
     pub(crate) frame: usize,
     pub(crate) camera: Camera,
     /// sRGB and mask.
-    rgba: Vec<u8>,
+    rgba: Arc<[u8]>,
     /// Pixels whose colour is mixed with the background.
-    mixed: Vec<bool>,
+    mixed: Arc<[bool]>,
 }
 
 impl TrainingView {
@@ -57,7 +59,7 @@ impl TrainingView {
         let mut camera = camera.clone();
         camera.intrinsics.center_px -= glam::DVec2::new(f64::from(left), f64::from(top));
         (camera.intrinsics.width, camera.intrinsics.height) = (columns, rows);
-        Some(Self { frame, camera, rgba: cut, mixed })
+        Some(Self { frame, camera, rgba: cut.into(), mixed: mixed.into() })
     }
 
     /// Returns the same image as one of another frame.

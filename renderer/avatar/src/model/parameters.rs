@@ -93,3 +93,26 @@ impl GaussianParameters {
         self.lists().iter().all(|list| list.par_iter().all(|row| row.iter().all(|value| value.is_finite())))
     }
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn steps_of_equal_size_end_exactly_at_the_target() {
+        let mut from = GaussianParameters::zeroed(3, HarmonicOrder::Zero);
+        let mut target = from.clone();
+        target.offset[1] = [0.1, -0.3, 7.0, 0.0];
+        target.harmonics[2] = [0.7, 1e-9, -2.0, 0.0];
+        for left in (1..=10u16).rev() {
+            from.approach(&target, 1.0 / f32::from(left));
+            let done = f32::from(11 - left) / 10.0;
+            assert!((from.offset[1][2] - 7.0 * done).abs() < 1e-4, "{} after {done}", from.offset[1][2]);
+        }
+        assert_eq!(from, target);
+        target.shape[0][3] = f32::NAN;
+        from.approach(&target, 0.5);
+        let poisoned = from.lists().concat().as_flattened().iter().filter(|value| value.is_nan()).count();
+        assert_eq!(poisoned, 1, "poison stays where it is");
+    }
+}

@@ -6,11 +6,11 @@ use flyrig_types::Pose;
 use glam::DVec3;
 
 /// Most key sets that are kept.
-pub(crate) const KEY_SETS: usize = 32;
+const KEY_SETS: usize = 32;
 /// One of so many key sets is held back from the fit.
 const HELD_BACK_EVERY: usize = 4;
 /// Least difference between two key sets: root mean square over the joints, metres in the room, positions relative to the root. A body that
-/// turns by 15 degrees differs by about as much.
+/// turns by 12 degrees differs by as much.
 const NEW_M: f64 = 0.06;
 /// Age from which a key set is replaced by one that shows the same, nanoseconds: light and clothes may have changed.
 const OLD_NANOS: u64 = 20_000_000_000;
@@ -100,6 +100,13 @@ impl KeySetChooser {
         Some(Choice { slot, is_new: true })
     }
 
+    /// Notes that a chosen frame set was lost: the next one of the same pose is chosen.
+    pub fn missed(&mut self, choice: Choice) {
+        if let Some(kept) = self.kept.get_mut(choice.slot) {
+            kept.nanos = kept.nanos.saturating_sub_unsigned(OLD_NANOS);
+        }
+    }
+
     /// Returns the key set that is most like another one, and their difference, metres.
     fn most_alike(&self) -> Option<(usize, f64)> {
         let gap = |i: usize| {
@@ -147,6 +154,15 @@ mod tests {
             "light and clothes may have changed"
         );
         assert_eq!(chooser.choose(&skeleton, &turned(&skeleton, 1.0), later + 1), None);
+        chooser.missed(Choice { slot: 0, is_new: false });
+        assert!(chooser.choose(&skeleton, &turned(&skeleton, 1.0), later + 1).is_some(), "the one before was lost");
+        let joints = |degrees: f64| -> Vec<DVec3> {
+            let pose = turned(&skeleton, degrees);
+            let world = skeleton.world_from_joint(&pose);
+            world.iter().map(|joint| joint.w_axis.truncate() - pose.root_translation).collect()
+        };
+        let by_angle = [11.0, 13.0].map(|degrees| difference(&joints(0.0), &joints(degrees)));
+        assert!(by_angle[0] < NEW_M && NEW_M < by_angle[1], "{by_angle:?}");
         let mut walked = turned(&skeleton, 0.0);
         walked.root_translation += DVec3::new(1.0, 0.0, 2.0);
         assert_eq!(chooser.choose(&skeleton, &walked, later), None, "the same side elsewhere");

@@ -27,7 +27,9 @@ const GOOD_QUALITY: f64 = 0.6;
 /// Coverage by other people from which an image is no key view.
 const OTHERS_COVER: u8 = 8;
 /// Steps of fitting per frame set where the learner works in place.
-pub(crate) const STEPS_PER_SET: u32 = 4;
+const STEPS_PER_SET: u32 = 4;
+/// Frame sets over which a new version replaces the one before.
+const BLENDED_SETS: u32 = 10;
 /// Names of counts.
 const KEY_SETS_COUNT: &str = "key sets to learn from";
 const ROUNDS_COUNT: &str = "rounds of learning";
@@ -142,6 +144,9 @@ impl PersonLearner {
             Place::Beside(thread) => thread.add(set),
             Place::Nowhere | Place::Failed => false,
         };
+        if !added {
+            self.chooser.missed(choice);
+        }
         stages.count(KEY_SETS_COUNT, u64::from(added));
         Ok(())
     }
@@ -218,9 +223,6 @@ impl PersonLearner {
         Ok(())
     }
 }
-
-/// Frame sets over which a new version replaces the one before.
-const BLENDED_SETS: u32 = 10;
 
 fn is_tracked_well(watch: &TrackWatch) -> bool {
     watch.state() == TrackState::Steady && watch.quality().is_some_and(|quality| quality >= GOOD_QUALITY)

@@ -143,6 +143,8 @@ impl Workshop {
     pub fn add(&mut self, set: KeySet) {
         self.came += 1;
         let Choice { slot, is_new } = set.choice;
+        // One that was lost on the way may come again.
+        let is_new = is_new || !self.sets.contains_key(&slot);
         self.fresh += usize::from(is_new);
         self.unchecked += usize::from(!is_new && is_held_back(slot));
         self.sets.insert(slot, (self.came, set));
