@@ -297,7 +297,7 @@ fn the_live_rig_starts_from_an_avatar() {
             assert!(motion.nodes.is_empty());
             let (mut posed, mut axes) = (Posed::default(), PosedAxes::default());
             let colors = person.pose(&motion, &mut posed);
-            assert!(person.pose_axes(&motion, &mut axes) && axes.rotation.len() == 4000);
+            assert!(person.pose_axes(&motion, &posed, &mut axes) && axes.rotation.len() == 4000);
             Some((camera, posed, axes, colors))
         });
         let gpu = GpuContext::new(&AdapterChoice::Best).unwrap().fastest();

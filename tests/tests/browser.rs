@@ -260,7 +260,7 @@ fn psnr_of_browser(who: Shown, drawing: &str, options: &[&str]) -> f64 {
     let (mut posed, mut axes) = (Posed::default(), PosedAxes::default());
     let template = state.people.get_mut(0).unwrap().template();
     template.pose(motion, &mut posed);
-    let has_axes = template.pose_axes(motion, &mut axes);
+    let has_axes = template.pose_axes(motion, &posed, &mut axes);
     assert_eq!(has_axes, who == Shown::Avatar);
     drop(state);
     let mut scene = PeopleScene::new(&gpu.fastest()).unwrap();

@@ -36,7 +36,7 @@ impl Stage {
             let Some(motion) = person.motion_at(now, false) else { continue };
             let (mut posed, mut axes) = (Posed::default(), PosedAxes::default());
             let colors = person.pose(&motion, &mut posed);
-            let is_avatar = person.pose_axes(&motion, &mut axes);
+            let is_avatar = person.pose_axes(&motion, &posed, &mut axes);
             posed_people.push((posed, colors, is_avatar.then_some(axes)));
         }
         let Some((first, ..)) = posed_people.first() else { return Ok(()) };

@@ -1,63 +1,36 @@
 //! Avatars as stream templates, which viewers pose and render themselves.
 
 use anyhow::{Context as _, Result};
-use flyrig_avatar::{Avatar, Bones, PosedAvatar};
-use flyrig_fusion::stream_joints;
-use flyrig_renderer::SH_DEGREE_0;
-use flyrig_stream::{AvatarGaussian, AvatarSource, EncodedTemplate, TemplateSource};
-use glam::Vec3;
+use flyrig_avatar::Avatar;
+use flyrig_fusion::encode_posed_avatar;
+use flyrig_stream::EncodedTemplate;
 
-/// Encodes an avatar in its rest pose, with the mean shape of its clothes and hair and its colours of order zero.
+/// Encodes an avatar for viewers that poses alone drive, see [`encode_posed_avatar`].
 ///
 /// # Errors
 /// A value is not finite or too large for the format.
 pub fn encode_avatar(avatar: &Avatar) -> Result<EncodedTemplate> {
-    let template = &avatar.template;
-    let mut rest = PosedAvatar::default();
-    avatar.pose(&Bones::at_rest(&template.skeleton), None, &mut rest);
-    let coefficients = avatar.parameters.order().coefficients();
-    let constants = avatar.parameters.harmonics.chunks(coefficients);
-    let rows = rest.scale_opacity.iter().zip(&rest.rotation).zip(constants);
-    let gaussians: Vec<AvatarGaussian> = rows
-        .map(|((&[x, y, z, opacity], &rotation), constant)| {
-            let color = constant.first().copied().unwrap_or_default();
-            let color = [0, 1, 2].map(|k| (SH_DEGREE_0 * color[k]).clamp(0.0, 1.0));
-            AvatarGaussian { scale_m: [x, y, z], opacity, rotation, color }
-        })
-        .collect();
-    // Viewers of isotropic Gaussians render discs of equal area.
-    let size = |[x, y, z]: [f32; 3]| {
-        let mut scales = [x, y, z];
-        scales.sort_by(f32::total_cmp);
-        (scales[1] * scales[2]).sqrt()
-    };
-    let rows = rest.center.iter().zip(&gaussians);
-    let center_scale: Vec<[f32; 4]> = rows.map(|(&[x, y, z, _], g)| [x, y, z, size(g.scale_m)]).collect();
-    let normals: Vec<[f32; 3]> = avatar.normals().iter().map(Vec3::to_array).collect();
-    let skin: Vec<_> = avatar.skin.iter().map(|skin| (skin.joints.map(u32::from), skin.weights)).collect();
-    let template = TemplateSource {
-        joints: &stream_joints(&template.skeleton),
-        center_scale: &center_scale,
-        normals: &normals,
-        skin: &skin,
-        node_weights: &[],
-        nodes: &[],
-    };
-    AvatarSource { template, gaussians: &gaussians, light: avatar.light.terms }
-        .encode()
-        .context("the avatar cannot be sent to viewers")
+    encode_posed_avatar(avatar).context("the avatar cannot be sent to viewers")
 }
 
 #[cfg(test)]
 mod tests {
-    use flyrig_avatar::AvatarScene;
+    use flyrig_avatar::{AvatarScene, Bones};
     use flyrig_body::{DEFAULT_SIGMA2_M2, ShapeParams, build_graph, default_template, sample_surface};
+    use std::sync::Arc;
+
+    use flyrig_fusion::{
+        FrameSet, GivenPerception, GivenPerson, Outcome, PersonEncoder, PersonId, PersonMemory, PersonMessages,
+        SessionBuilder, SessionSettings,
+    };
     use flyrig_gpu::{AdapterChoice, GpuContext};
     use flyrig_renderer::HarmonicOrder;
-    use flyrig_stream::{Motion, MotionEncoder, Posed, PosedAxes, StreamTemplate};
-    use flyrig_types::{Camera, Intrinsics, Isometry, Lens};
+    use flyrig_stream::{ColorDecoder, ColorSettings, Motion, MotionEncoder, Posed, PosedAxes, StreamTemplate};
+    use flyrig_types::{
+        Camera, Frame, Image, Intrinsics, Isometry, Lens, Mask, PixelFormat, PoseTrack, RenderedView, Rig,
+    };
     use flyrig_viewer::{PeopleScene, ShownPerson};
-    use glam::{DQuat, DVec2, DVec3, Vec4};
+    use glam::{DQuat, DVec2, DVec3, Vec3, Vec4};
 
     use super::*;
 
@@ -104,7 +77,7 @@ mod tests {
         let motion = Motion::decode(&bytes, &template).unwrap();
         let (mut posed, mut axes) = (Posed::default(), PosedAxes::default());
         template.pose(&motion, &mut posed);
-        assert!(template.pose_axes(&motion, &mut axes));
+        assert!(template.pose_axes(&motion, &posed, &mut axes));
 
         let mut ours = PeopleScene::new(&gpu).unwrap();
         let mut colors = Vec::new();
@@ -115,27 +88,13 @@ mod tests {
         theirs.pose(&avatar, &Bones::new(skeleton, &pose), None);
         let middle = pose.root_translation;
         for side in [DVec3::Z, DVec3::NEG_Z, DVec3::X] {
-            let camera = Camera {
-                id: "view".into(),
-                intrinsics: Intrinsics {
-                    width: 160,
-                    height: 224,
-                    focal_px: DVec2::splat(240.0),
-                    center_px: DVec2::new(80.0, 112.0),
-                    lens: Lens::PINHOLE,
-                },
-                camera_from_world: Isometry::look_at(middle + side * 2.6, middle, DVec3::Y),
-                time_offset_nanos: 0,
-                color: Default::default(),
-            };
+            let camera = beside(middle, side, "view");
             ours.set_people([shown]).unwrap();
             let (found, expected) = (ours.draw(&camera).unwrap(), theirs.draw(&camera).unwrap());
             let opaque = expected.rgba.chunks_exact(4).filter(|pixel| pixel[3] > 200).count();
             assert!(opaque > 2000, "{opaque} pixels show the person");
-            let squares: f64 =
-                found.rgba.iter().zip(&expected.rgba).map(|(a, b)| f64::from(a.abs_diff(*b)).powi(2)).sum();
-            let decibels = 10.0 * (255.0f64.powi(2) * found.rgba.len() as f64 / squares.max(1.0)).log10();
-            assert!(decibels > 38.0, "{side}: {decibels} dB");
+            let loss = decibels(&found, &expected);
+            assert!(loss > 38.0, "{side}: {loss} dB");
             // Beside a person without an avatar, both are rendered.
             let mut far = posed.clone();
             far.center_scale.iter_mut().for_each(|row| row[0] += 100.0);
@@ -144,6 +103,106 @@ mod tests {
             let both = ours.draw(&camera).unwrap();
             let most = both.rgba.iter().zip(&found.rgba).map(|(a, b)| a.abs_diff(*b)).max();
             assert!(most.unwrap() <= 1, "{side}: {most:?}");
+        }
+    }
+
+    /// Returns a camera 2.6 m beside a point.
+    fn beside(middle: DVec3, side: DVec3, name: &str) -> Camera {
+        Camera {
+            id: name.into(),
+            intrinsics: Intrinsics {
+                width: 160,
+                height: 224,
+                focal_px: DVec2::splat(240.0),
+                center_px: DVec2::new(80.0, 112.0),
+                lens: Lens::PINHOLE,
+            },
+            camera_from_world: Isometry::look_at(middle + side * 2.6, middle, DVec3::Y),
+            time_offset_nanos: 0,
+            color: Default::default(),
+        }
+    }
+
+    /// Returns how much two images differ, decibels.
+    fn decibels(found: &RenderedView, expected: &RenderedView) -> f64 {
+        let squares: f64 = found.rgba.iter().zip(&expected.rgba).map(|(a, b)| f64::from(a.abs_diff(*b)).powi(2)).sum();
+        10.0 * (255.0f64.powi(2) * found.rgba.len() as f64 / squares.max(1.0)).log10()
+    }
+
+    /// A tracked person who is made of an avatar: viewers get its axes once, and then motion and colours.
+    #[test]
+    fn viewers_draw_a_tracked_avatar_as_the_rig_does() {
+        let gpu = GpuContext::new(&AdapterChoice::Best).unwrap().fastest();
+        let avatar = avatar();
+        let mut pose = avatar.template.skeleton.rest_pose();
+        for (k, rotation) in pose.joint_rotations.iter_mut().enumerate() {
+            *rotation *= DQuat::from_rotation_z(0.25 * (k as f64 * 2.3).sin());
+        }
+        let middle = pose.root_translation;
+        let sides = [("a", DVec3::Z), ("b", DVec3::NEG_Z), ("c", DVec3::X)];
+        let cameras: Vec<Camera> = sides.map(|(name, side)| beside(middle, side, name)).into();
+        let rig = Rig { cameras: cameras.clone(), world_up: DVec3::Y };
+        // Images of the avatar with its clothes moved, in a darker light.
+        let mut truth = avatar.clone();
+        truth.light.terms[0] = [0.6; 3];
+        truth.hanging.as_mut().unwrap().mean.iter_mut().for_each(|by| *by = DVec3::new(0.02, 0.0, 0.03));
+        let mut scene = AvatarScene::new(&gpu, &truth).unwrap();
+        scene.pose(&truth, &Bones::new(&truth.template.skeleton, &pose), None);
+        let frame = |camera: &Camera| {
+            let view = scene.draw(camera).unwrap();
+            let (width, height) = (view.width, view.height);
+            let rgb: Vec<u8> = view.rgba.chunks_exact(4).flat_map(|pixel| [pixel[0], pixel[1], pixel[2]]).collect();
+            let mask = view.rgba.iter().skip(3).step_by(4).copied().collect();
+            Some(Arc::new(Frame {
+                camera: camera.id.clone(),
+                sequence: 0,
+                capture_nanos: 0,
+                exposure_nanos: None,
+                image: Image::new(width, height, PixelFormat::Rgb8, rgb).unwrap(),
+                mask: Some(Mask::new(width, height, mask).unwrap()),
+            }))
+        };
+        let frames: Vec<_> = cameras.iter().map(frame).collect();
+
+        let track = PoseTrack::new(vec![(0, pose.clone()), (1_000_000_000, pose.clone())]).unwrap();
+        let (person, template) = (PersonId::default(), avatar.template.clone());
+        let given = GivenPerson { person, template, track, repeat: true };
+        let mut settings = SessionSettings::default();
+        settings.body.gaussians = 12_000;
+        let mut session = SessionBuilder::new(gpu.clone(), rig.clone())
+            .settings(settings)
+            .perception(GivenPerception::new(&rig, vec![given]).dressed())
+            .person(person, PersonMemory::of_avatar(Arc::new(avatar)))
+            .build()
+            .unwrap();
+        let mut received = None;
+        for index in 0..6 {
+            let set = FrameSet { index, master_nanos: index as i64 * 33_000_000, frames: frames.clone() };
+            assert_eq!(session.process(&set).unwrap(), Outcome::Updated);
+            let frame = session.person_frame(person, &set).unwrap().unwrap();
+            let (encoder, template, decoder) = received.get_or_insert_with(|| {
+                let template = StreamTemplate::decode(&frame.template().bytes).unwrap();
+                let decoder = ColorDecoder::new(&template);
+                (PersonEncoder::new(&frame, ColorSettings::default(), 1), template, decoder)
+            });
+            let PersonMessages { motion, colors, .. } = encoder.encode(&frame).unwrap();
+            colors.iter().for_each(|layer| drop(decoder.ingest(layer).unwrap()));
+            let motion = Motion::decode(&motion, template).unwrap();
+            let (mut posed, mut axes, mut colors) = (Posed::default(), PosedAxes::default(), Vec::new());
+            template.pose(&motion, &mut posed);
+            assert!(template.has_axes() && !template.has_colors() && template.nodes() == 100);
+            assert!(template.pose_axes(&motion, &posed, &mut axes));
+            decoder.colors(&mut colors);
+            let mut viewer = PeopleScene::new(&gpu).unwrap();
+            viewer.set_people([ShownPerson { posed: &posed, colors: &colors, axes: Some(&axes) }]).unwrap();
+            for camera in &cameras {
+                let (found, expected) = (viewer.draw(camera).unwrap(), session.render(camera).unwrap());
+                let loss = decibels(&found, &expected);
+                assert!(loss > 38.0, "{index} {}: {loss} dB", camera.id);
+            }
+            // The images have made it darker than the avatar was.
+            let mean = |list: &[[f32; 4]]| list.iter().map(|c| c[0] + c[1] + c[2]).sum::<f32>() / list.len() as f32;
+            assert!(index < 5 || mean(&colors) < 0.8, "{}", mean(&colors));
         }
     }
 

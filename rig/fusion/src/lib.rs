@@ -66,7 +66,7 @@ pub use settings::{
 };
 pub use subject::{
     Observed, PROCESSOR_STAGE, PersonFrame, PersonMemory, Remedy, Subject, TrackState, TrackWatch, Upright,
-    person_gaussians, person_surface, stream_joints,
+    encode_posed_avatar, person_gaussians, person_surface, stream_joints,
 };
 
 pub use flyrig_renderer::Splat;

@@ -106,6 +106,14 @@ fn show(session: &mut Session, avatar: &Avatar, from: i64, to: i64) -> f64 {
     sum
 }
 
+/// Returns the template that viewers draw: its hash, and whether it has the axes of an avatar.
+fn template_of_stream(session: &Session) -> (u64, bool) {
+    let empty = (vec![90; (SIZE * SIZE * 3) as usize], vec![0; (SIZE * SIZE) as usize]);
+    let frame = session.person_frame(ME, &frame_set(0, &vec![empty; 4])).unwrap().unwrap();
+    let template = &frame.template().template;
+    (template.hash, template.has_axes() && !template.has_colors())
+}
+
 fn count(session: &Session, name: &str) -> u64 {
     session.stages.counts().find(|(known, _)| *known == name).map_or(0, |(_, count)| count)
 }
@@ -124,6 +132,7 @@ fn a_learnt_person_is_seen_better_by_another_camera_and_reruns_are_identical() {
     assert!(count(&first, "versions of the person adopted") > 0);
     assert!(with < 0.8 * without, "{with}, without learning {without}");
     assert_eq!(count(&first, "versions of the person dropped"), 0);
+    assert!(template_of_stream(&first).1, "viewers draw the avatar");
     let (_, second) = run(learning());
     assert_eq!(first.memory(ME).unwrap(), second.memory(ME).unwrap());
 
@@ -161,7 +170,12 @@ fn a_person_who_leaves_for_long_is_forgotten_and_a_thread_ends_with_its_session(
     let avatar = truth([[0.5, 0.05, 0.03], [0.05, 0.1, 0.5]]);
     let mut session = session(gpu(), learning(), None);
     session.set_learning_steps(25);
-    show(&mut session, &avatar, 0, 90);
+    show(&mut session, &avatar, 0, 10);
+    let (surface, has_axes) = template_of_stream(&session);
+    assert!(!has_axes);
+    show(&mut session, &avatar, 10, 90);
+    let (version, has_axes) = template_of_stream(&session);
+    assert!(has_axes && version != surface);
     let empty = (vec![90; (SIZE * SIZE * 3) as usize], vec![0; (SIZE * SIZE) as usize]);
     let nobody = |index| frame_set(index, &vec![empty.clone(); 4]);
     for index in 90..125 {
@@ -169,6 +183,7 @@ fn a_person_who_leaves_for_long_is_forgotten_and_a_thread_ends_with_its_session(
     }
     show(&mut session, &avatar, 125, 136);
     assert!(session.memory(ME).unwrap().avatar().is_none(), "another person may have come");
+    assert_eq!(template_of_stream(&session), (surface, false));
 
     let mut beside = self::session(gpu(), learning(), None);
     beside.use_threads();

@@ -1,7 +1,7 @@
 //! Avatars against plain f64 references, and damaged ones.
 #![allow(clippy::unwrap_used)] // helpers of tests
 
-use std::{string::ToString as _, vec::Vec};
+use std::{string::ToString as _, vec, vec::Vec};
 
 use rand::{RngExt as _, SeedableRng as _, rngs::StdRng};
 
@@ -33,7 +33,7 @@ fn gaussians(count: usize) -> Vec<AvatarGaussian> {
 }
 
 fn encoded(person: &Person, gaussians: &[AvatarGaussian]) -> EncodedTemplate {
-    AvatarSource { template: person.source(), gaussians, light: LIGHT }.encode().unwrap()
+    AvatarSource { template: person.source(), gaussians, light: Some(LIGHT) }.encode().unwrap()
 }
 
 /// Returns the rows of a unit quaternion's matrix in f64.
@@ -80,8 +80,8 @@ fn shapes_and_colors_come_back_and_turn_as_the_reference() {
         turns.push(turns.last().map_or(own, |parent| times(*parent, own)));
     }
     let (mut axes, mut posed) = (PosedAxes::default(), Posed::default());
-    assert!(decoded.pose_axes(&motion, &mut axes));
     decoded.pose(&motion, &mut posed);
+    assert!(decoded.pose_axes(&motion, &posed, &mut axes));
     let mut colors = Vec::new();
     assert!(decoded.avatar_colors(&posed, &mut colors));
     assert_eq!((axes.rotation.len(), axes.scale_opacity.len(), posed.center_scale.len()), (2000, 2000, 2000));
@@ -112,7 +112,9 @@ fn shapes_and_colors_come_back_and_turn_as_the_reference() {
     }
     // Other templates have no axes, and a pose is a few dozen bytes.
     let plain = person.encode();
-    assert!(!plain.template.pose_axes(&motion, &mut axes) && !plain.template.avatar_colors(&posed, &mut colors));
+    assert!(
+        !plain.template.pose_axes(&motion, &posed, &mut axes) && !plain.template.avatar_colors(&posed, &mut colors)
+    );
     let bytes = MotionEncoder::new(&encoded).encode(&motion).unwrap();
     assert!(bytes.len() < 100, "{}", bytes.len());
     assert_eq!(Motion::decode(&bytes, &decoded).unwrap().stamp.template, decoded.hash);
@@ -142,16 +144,16 @@ fn every_rotation_survives_its_code() {
 fn poisoned_avatars_are_refused() {
     let person = Person::tube(60, 0);
     let refused = |person: &Person, gaussians: &[AvatarGaussian], text: &str| {
-        let source = AvatarSource { template: person.source(), gaussians, light: LIGHT };
+        let source = AvatarSource { template: person.source(), gaussians, light: Some(LIGHT) };
         let error = source.encode().unwrap_err().to_string();
         assert!(error.contains(text), "{error}");
     };
     let mut dark = LIGHT;
     dark[4][1] = f32::NAN;
-    let source = AvatarSource { template: person.source(), gaussians: &gaussians(60), light: dark };
+    let source = AvatarSource { template: person.source(), gaussians: &gaussians(60), light: Some(dark) };
     assert!(source.encode().unwrap_err().to_string().contains("light is not finite"));
     refused(&person, &gaussians(59), "differ in length");
-    refused(&Person::tube(60, 4), &gaussians(60), "no nodes");
+    refused(&Person::tube(60, 4), &gaussians(60), "has no nodes");
     refused(&Person::tube(0, 0), &[], "one Gaussian");
     let poisons: [fn(&mut AvatarGaussian); 4] = [
         |g| g.scale_m[1] = f32::NAN,
@@ -167,25 +169,87 @@ fn poisoned_avatars_are_refused() {
 }
 
 #[test]
-fn damaged_avatars_are_no_panic() {
-    let person = Person::tube(300, 0);
-    let bytes = encoded(&person, &gaussians(300)).bytes;
-    let mut refused = 0;
-    damaged(&bytes, 3000, |bytes| match StreamTemplate::decode(bytes) {
-        Ok(template) => {
-            let mut axes = PosedAxes::default();
-            if template.pose_axes(&person.motion(1), &mut axes) {
-                let numbers = axes.rotation.iter().chain(&axes.scale_opacity).flatten();
-                let (mut posed, mut colors) = (Posed::default(), Vec::new());
-                template.pose(&person.motion(1), &mut posed);
-                assert!(template.avatar_colors(&posed, &mut colors));
-                assert!(colors.iter().flatten().all(|value| value.is_finite()));
-                assert!(numbers.into_iter().all(|v| v.is_finite()) && axes.rotation.len() == template.gaussians());
+fn a_tracked_avatar_moves_and_grows_with_its_nodes() {
+    let person = Person::tube(2000, 40);
+    let source = gaussians(2000);
+    let encoded = AvatarSource { template: person.source(), gaussians: &source, light: None }.encode().unwrap();
+    let decoded = StreamTemplate::decode(&encoded.bytes).unwrap();
+    assert_eq!(decoded, encoded.template);
+    assert!(decoded.has_axes() && !decoded.has_colors() && decoded.nodes() == 40);
+    // Three bytes less per Gaussian than with colours.
+    let still = Person::tube(2000, 0);
+    let with_colors = self::encoded(&still, &source).bytes.len() - still.encode().bytes.len();
+    let without = encoded.bytes.len() - person.encode().bytes.len();
+    assert_eq!(with_colors - without, 3 * 2000 + 12 * LIGHT_TERMS - 40 * 12);
+
+    // Centres and growth are those of the same surface without axes, but for the places of the nodes, which are exact here.
+    let mut motion = person.motion(4);
+    motion.nodes.iter_mut().flatten().for_each(|by| *by *= 20.0);
+    let own = |template: &EncodedTemplate| Motion {
+        nodes: template.node_order.iter().map(|node| motion.nodes[*node as usize]).collect(),
+        ..motion.clone()
+    };
+    let (mut posed, mut axes, mut at_rest) = (Posed::default(), PosedAxes::default(), PosedAxes::default());
+    let still = Motion { nodes: vec![[0.0; 3]; 40], ..motion.clone() };
+    decoded.pose(&still, &mut posed);
+    assert!(decoded.pose_axes(&still, &posed, &mut at_rest));
+    decoded.pose(&own(&encoded), &mut posed);
+    assert!(decoded.pose_axes(&own(&encoded), &posed, &mut axes));
+    let spread = |on: &([u32; 4], [f32; 4]), by: f64| -> f64 {
+        let place = |node: u32, k: usize| {
+            f64::from(person.nodes[node as usize][k]) + by * f64::from(motion.nodes[node as usize][k])
+        };
+        // Nodes without a quantised weight count for nothing.
+        let sum: f32 = on.1.iter().sum();
+        let mut list: Vec<u32> = (0..4).filter(|k| on.1[*k] / sum * 255.0 >= 0.5).map(|k| on.0[k]).collect();
+        list.sort_unstable();
+        let mut squares = 0.0;
+        for (i, a) in list.iter().enumerate() {
+            for b in &list[..i] {
+                squares += (0..3).map(|k| (place(*a, k) - place(*b, k)).powi(2)).sum::<f64>();
             }
         }
-        Err(_) => refused += 1,
-    });
-    assert!(refused > 500, "{refused}");
+        squares
+    };
+    let mut grown = 0;
+    for (i, &from) in encoded.gaussian_order.iter().enumerate() {
+        let on = &person.node_weights[from as usize];
+        let (before, after) = (spread(on, 0.0), spread(on, 1.0));
+        let expected = flyrig_model::stretch::growth(before as f32, after as f32, libm::sqrtf);
+        for k in 0..3 {
+            let found = axes.scale_opacity[i][k] / at_rest.scale_opacity[i][k];
+            assert!((found / expected - 1.0).abs() < 1e-3, "{i}: {found} {expected}");
+        }
+        assert_eq!(axes.scale_opacity[i][3].to_bits(), at_rest.scale_opacity[i][3].to_bits());
+        grown += usize::from(expected > 1.01);
+    }
+    assert!(grown > 200, "{grown} Gaussians have grown");
+    assert_eq!(axes.rotation, at_rest.rotation);
+    let mut colors = Vec::new();
+    assert!(!decoded.avatar_colors(&posed, &mut colors) && colors.is_empty());
+}
+
+#[test]
+fn damaged_avatars_are_no_panic() {
+    let mut refused = 0;
+    for (nodes, light) in [(0, Some(LIGHT)), (20, None)] {
+        let person = Person::tube(300, nodes);
+        let source = AvatarSource { template: person.source(), gaussians: &gaussians(300), light };
+        damaged(&source.encode().unwrap().bytes, 3000, |bytes| match StreamTemplate::decode(bytes) {
+            Ok(template) => {
+                let (mut posed, mut axes, mut colors) = (Posed::default(), PosedAxes::default(), Vec::new());
+                template.pose(&person.motion(1), &mut posed);
+                if template.pose_axes(&person.motion(1), &posed, &mut axes) {
+                    assert_eq!(template.avatar_colors(&posed, &mut colors), template.has_colors());
+                    let numbers = axes.rotation.iter().chain(&axes.scale_opacity).chain(&colors).flatten();
+                    assert!(numbers.into_iter().all(|v| v.is_finite()) && axes.rotation.len() == template.gaussians());
+                }
+            }
+            Err(_) => refused += 1,
+        });
+    }
+    assert!(refused > 1000, "{refused}");
+    let bytes = encoded(&Person::tube(300, 0), &gaussians(300)).bytes;
     let mut newer = bytes.clone();
     newer[3] = 9;
     assert_eq!(StreamTemplate::decode(&newer).unwrap_err(), StreamError::Version { what: "avatar", found: 9 });

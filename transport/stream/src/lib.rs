@@ -4,7 +4,8 @@
 //! |---|---|---|
 //! | [`StreamTemplate`] | Gaussians at rest, skin and node weights, skeleton | once per viewer, by its hash |
 //! | [`Motion`] | pose, translations of the deformation graph's nodes | every frame, decodable by itself |
-//! | template with axes and colours ([`AvatarSource`]) | avatar, moved by its pose alone | once per viewer; then no colours |
+//! | template with axes ([`AvatarSource`]) | avatar: anisotropic Gaussians with opacities | once per viewer, by its hash |
+//! | template with axes and colours | avatar that its pose alone drives | once per viewer; then no colours |
 //! | colours, in [`LAYERS`] layers | changes since the previous message, from coarse to fine | every frame |
 //! | [`WholeColors::whole`] | present state of the colours, by layer | for a viewer that joins, or missed changes |
 //! | [`SplatState`] | all Gaussians in the world, without skinning | every frame, decodable by itself |

@@ -8,8 +8,10 @@ pub const MAX_MESSAGE_BYTES: usize = 65_000;
 
 /// Magic letters of a [`crate::StreamTemplate`] without axes and colours.
 pub(crate) const TEMPLATE_MAGIC: [u8; 3] = *b"FLT";
-/// Magic letters of an avatar.
+/// Magic letters of an avatar with its colours.
 pub(crate) const AVATAR_MAGIC: [u8; 3] = *b"FLA";
+/// Magic letters of an avatar whose colours are messages.
+pub(crate) const TRACKED_MAGIC: [u8; 3] = *b"FLE";
 /// Magic letters of a [`crate::Motion`].
 pub(crate) const MOTION_MAGIC: [u8; 3] = *b"FLM";
 /// Magic letters of a layer of colours.

@@ -3,7 +3,7 @@
 use alloc::vec::Vec;
 
 use crate::{
-    attributes::AvatarAttributes,
+    attributes::{Look, Shapes},
     bytes::Fields,
     error::StreamError,
     message::{CODEC_VERSION, TEMPLATE_MAGIC},
@@ -27,7 +27,7 @@ const MAX_NODES: usize = 1 << 16;
 /// Least bytes per Gaussian (people take 9 to 12): it bounds the time and memory that a message can claim.
 const LEAST_BYTES: usize = 5;
 /// Largest coordinate, metres.
-const MAX_COORDINATE_M: f32 = 1e4;
+pub(crate) const MAX_COORDINATE_M: f32 = 1e4;
 
 const WHAT: &str = "template";
 
@@ -78,8 +78,10 @@ pub struct StreamTemplate {
     pub(crate) node_places: Vec<[f32; 3]>,
     /// Prediction of each node.
     pub(crate) predictions: Vec<Prediction>,
-    /// Axes and colours of an avatar.
-    pub(crate) avatar: Option<AvatarAttributes>,
+    /// Shapes of anisotropic Gaussians.
+    pub(crate) shapes: Option<Shapes>,
+    /// Colours that are part of the template.
+    pub(crate) look: Option<Look>,
 }
 
 /// Template with its bytes and the order of its source.
@@ -255,7 +257,8 @@ impl StreamTemplate {
             rest_spread: Vec::new(),
             node_places: alloc::vec![[0.0; 3]; nodes],
             predictions: Vec::new(),
-            avatar: None,
+            shapes: None,
+            look: None,
         };
         // Largest weight on each node, and the normal of that Gaussian.
         let mut most = alloc::vec![(0, [0.0; 3]); nodes];
@@ -286,10 +289,15 @@ impl StreamTemplate {
             }
         }
         let normals: Vec<[f32; 3]> = most.iter().map(|(_, normal)| *normal).collect();
-        let places = &template.node_places;
-        template.rest_spread = template.node_weights.iter().map(|on| spread(on, |node| places[node])).collect();
+        template.measure_spread();
         template.predictions = predictions(&template.node_places, &normals, &template.node_weights);
         Ok(template)
+    }
+
+    /// Measures the spread of each Gaussian's nodes at rest.
+    pub(crate) fn measure_spread(&mut self) {
+        let places = &self.node_places;
+        self.rest_spread = self.node_weights.iter().map(|on| spread(on, |node| places[node])).collect();
     }
 
     /// Returns the number of Gaussians.

@@ -165,19 +165,19 @@ impl Page {
             list.clear();
         }
         self.ellipsoids.clear();
-        let is_avatar = |number: u32| self.people.get(number).is_some_and(|person| person.template().is_avatar());
-        let has_avatar = motions.iter().any(|((number, ..), _)| is_avatar(*number));
+        let has_axes = |number: u32| self.people.get(number).is_some_and(|person| person.template().has_axes());
+        let has_avatar = motions.iter().any(|((number, ..), _)| has_axes(*number));
         for ((number, ..), motion) in &motions {
             let Some(person) = self.people.get_mut(*number) else { continue };
             let colors = person.pose(motion, &mut self.posed);
             // The light changes an avatar's colours in each pose.
-            recolored |= moved && person.template().is_avatar();
+            recolored |= moved && person.template().has_colors();
             let count = self.posed.center_scale.len().min(colors.len());
             self.centers.extend_from_slice(&self.posed.center_scale[..count]);
             self.normals.extend_from_slice(&self.posed.normal[..count]);
             self.colors.extend_from_slice(&colors[..count]);
             if has_avatar {
-                let axes = person.pose_axes(motion, &mut self.axes).then_some(&self.axes);
+                let axes = person.pose_axes(motion, &self.posed, &mut self.axes).then_some(&self.axes);
                 self.ellipsoids.push(&self.posed.center_scale[..count], &colors[..count], axes);
             }
         }

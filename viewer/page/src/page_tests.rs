@@ -24,7 +24,7 @@ fn avatar() -> EncodedTemplate {
         .collect();
     let mut light = [[0.0; 3]; LIGHT_TERMS];
     light[0] = [1.0; 3];
-    encode(1.0, [-1.0, 1.0], |template| AvatarSource { template, gaussians: &gaussians, light }.encode())
+    encode(1.0, [-1.0, 1.0], |template| AvatarSource { template, gaussians: &gaussians, light: Some(light) }.encode())
 }
 
 /// `facing`: y of the normals of every other Gaussian.
@@ -203,6 +203,31 @@ fn damaged_messages_are_refused_and_change_nothing() {
 }
 
 #[test]
+fn a_tracked_avatar_has_axes_and_gets_its_colors_by_messages() {
+    let mut page = page();
+    let gaussian =
+        AvatarGaussian { scale_m: [0.02, 0.004, 0.001], opacity: 0.8, rotation: [0.1, 0.2, 0.3, 0.9], color: [0.0; 3] };
+    let gaussians = [gaussian; GAUSSIANS];
+    let encoded =
+        encode(1.0, [-1.0, -1.0], |template| AvatarSource { template, gaussians: &gaussians, light: None }.encode());
+    page.ingest(PageMessageKind::Template, 0, &encoded.bytes, 0.0).unwrap();
+    page.ingest(PageMessageKind::Motion, 0, &motion(&encoded, 1, 0.5), 0.0).unwrap();
+    assert_eq!(page.pose(0.0, false), (true, true));
+    assert!(!page.is_complete() && page.rotations().len() == GAUSSIANS);
+    let stamp = Stamp { frame: 1, capture_nanos: 1, ..Stamp::default() };
+    let mut colors = ColorEncoder::new(&encoded, ColorSettings::default(), 1);
+    for layer in colors.encode(stamp, &[[0.5, 0.2, 0.1, 1.0]; GAUSSIANS]) {
+        page.ingest(PageMessageKind::Colors, 0, &layer, 0.0).unwrap();
+    }
+    assert_eq!(page.pose(0.0, false), (false, true));
+    assert!(page.is_complete());
+    assert!(page.colors().iter().all(|color| (color[0] - 0.5).abs() < 0.05), "{:?}", page.colors()[0]);
+    // The opacity is that of the template.
+    page.look(640, 480);
+    assert!(page.scales().iter().all(|scale| (scale[3] - 0.8).abs() < 0.003), "{:?}", page.scales()[0]);
+}
+
+#[test]
 fn an_avatar_has_the_axes_of_its_template_and_hides_what_faces_away() {
     let (mut page, encoded, plain) = (page(), avatar(), template(1.0));
     page.ingest(PageMessageKind::Template, 0, &encoded.bytes, 0.0).unwrap();
@@ -213,7 +238,7 @@ fn an_avatar_has_the_axes_of_its_template_and_hides_what_faces_away() {
     let received = Motion::decode(&bytes, &encoded.template).unwrap();
     let (mut posed, mut axes) = (Posed::default(), PosedAxes::default());
     encoded.template.pose(&received, &mut posed);
-    assert!(encoded.template.pose_axes(&received, &mut axes));
+    assert!(encoded.template.pose_axes(&received, &posed, &mut axes));
     assert_eq!((page.rotations(), page.centers()), (axes.rotation.as_slice(), posed.center_scale.as_slice()));
     let mut order = page.order(640, 480).to_vec();
     order.sort_unstable();

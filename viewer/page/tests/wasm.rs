@@ -84,8 +84,9 @@ fn the_shipped_module_decodes_poses_and_sorts_as_this_crate_does() {
             color: [random().abs(), random().abs(), random().abs()],
         })
         .collect();
-    let avatar =
-        AvatarSource { template: source, gaussians: &gaussians, light: [[0.5; 3]; LIGHT_TERMS] }.encode().unwrap();
+    let light = [[0.5; 3]; LIGHT_TERMS];
+    let [avatar, tracked] = [Some(light), None]
+        .map(|light| AvatarSource { template: source, gaussians: &gaussians, light }.encode().unwrap());
     let colors: Vec<[f32; 4]> = (0..GAUSSIANS).map(|_| [random().abs(), random().abs(), random().abs(), 1.0]).collect();
     let camera = Camera {
         time_offset_nanos: 0,
@@ -157,22 +158,31 @@ fn the_shipped_module_decodes_poses_and_sorts_as_this_crate_does() {
     assert_eq!((shipped.call::<_, f64>("person", 0u32), shipped.call::<_, f64>("person", 1u32)), (1.0, -1.0));
     assert_eq!((shipped.call::<_, u32>("rotations", ()), shipped.call::<_, u32>("scales", ())), (0, 0));
 
-    // An avatar beside the same person.
-    let stamp = Stamp { frame: 4, capture_nanos: 160_000_000, person: 2, ..Stamp::default() };
-    let joint_rotations = vec![[0.0, 0.0, 0.1, 0.995], [0.1, 0.0, 0.0, 0.995]];
-    let motion = Motion { stamp, root_translation: [1.0, 0.0, 1.0], joint_rotations, nodes: Vec::new() };
-    let motion = MotionEncoder::new(&avatar).encode(&motion).unwrap();
-    for (kind, bytes) in [(1, &avatar.bytes), (2, &motion)] {
-        ours.ingest(PageMessageKind::of(kind).unwrap(), 2, bytes, 0.16).unwrap();
-        assert_eq!(shipped.take(kind, 2, bytes, 0.16), 0);
+    // An avatar with its colours beside the same person, and one whose colours are messages.
+    for (person, avatar) in [(2, &avatar), (3, &tracked)] {
+        let stamp = Stamp { frame: 4, capture_nanos: 160_000_000, person, ..Stamp::default() };
+        let joint_rotations = vec![[0.0, 0.0, 0.1, 0.995], [0.1, 0.0, 0.0, 0.995]];
+        let motion = Motion { stamp, root_translation: [1.0, 0.0, 1.0], joint_rotations, nodes: Vec::new() };
+        let motion = MotionEncoder::new(avatar).encode(&motion).unwrap();
+        let layers = ColorEncoder::new(avatar, ColorSettings::default(), 1).encode(stamp, &colors);
+        let mut messages = vec![(1, &avatar.bytes), (2, &motion)];
+        if !avatar.template.has_colors() {
+            messages.extend(layers.iter().map(|layer| (3, layer)));
+        }
+        for (kind, bytes) in messages {
+            ours.ingest(PageMessageKind::of(kind).unwrap(), person, bytes, 0.16).unwrap();
+            assert_eq!(shipped.take(kind, person, bytes, 0.16), 0);
+        }
     }
     ours.pose(0.16, false);
     ours.look(640, 480).unwrap();
-    assert_eq!(shipped.call::<_, u32>("pose", (0.16, 0u32)), 2 * GAUSSIANS as u32);
+    assert_eq!(shipped.call::<_, u32>("pose", (0.16, 0u32)), 3 * GAUSSIANS as u32);
+    let painted = shipped.call("colors", ());
+    assert_eq!(shipped.read::<Bits>(painted, 12 * GAUSSIANS)[8 * GAUSSIANS..], bits(ours.colors())[8 * GAUSSIANS..]);
     assert_eq!(shipped.call::<_, u32>("look", (640u32, 480u32)), 1);
     let (rotations, scales) = (shipped.call("rotations", ()), shipped.call("scales", ()));
-    assert_eq!(shipped.read::<Bits>(rotations, 8 * GAUSSIANS), bits(ours.rotations()));
-    let (found, expected) = (shipped.read::<Bits>(scales, 8 * GAUSSIANS), bits(ours.scales()));
+    assert_eq!(shipped.read::<Bits>(rotations, 12 * GAUSSIANS), bits(ours.rotations()));
+    let (found, expected) = (shipped.read::<Bits>(scales, 12 * GAUSSIANS), bits(ours.scales()));
     // At the limit, the libraries' sines decide who faces away.
     let differ = found.iter().zip(&expected).filter(|(a, b)| a != b).count();
     assert!(differ <= 4 && expected.iter().filter(|bits| bits.0 == 0).count() > GAUSSIANS / 8, "{differ} differ");

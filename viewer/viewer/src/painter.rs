@@ -201,7 +201,7 @@ fn draw(
             }
             let drawn = &mut posed[shown];
             drawn.colors = person.pose(&motion, &mut drawn.posed);
-            drawn.is_avatar = person.pose_axes(&motion, &mut drawn.axes);
+            drawn.is_avatar = person.pose_axes(&motion, &drawn.posed, &mut drawn.axes);
             shown += 1;
             is_complete &= person.is_complete();
             place = place.or_else(|| Some(DVec3::from(motion.root_translation.map(f64::from))));

@@ -437,7 +437,7 @@ impl View {
     }
 }
 
-/// Returns whether colours are sent beside motion; an avatar's are part of it.
+/// Returns whether colours are sent beside motion; an avatar that poses alone drive has its own.
 fn are_colors_sent(state: &ReceiverState) -> bool {
-    state.people.iter().any(|(_, person)| !person.template().is_avatar())
+    state.people.iter().any(|(_, person)| !person.template().has_colors())
 }

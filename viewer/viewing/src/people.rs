@@ -13,6 +13,8 @@ use crate::person::StreamPerson;
 pub const MAX_PEOPLE: usize = 32;
 /// Largest number of messages that wait for their template.
 const MAX_WAITING: usize = 64;
+/// Time for which a person with a new template is shown as before, until the new colours have arrived, seconds.
+const PATIENCE_SECS: f64 = 2.0;
 
 /// Outcome of ingesting a message.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -32,10 +34,19 @@ struct Waiting {
     arrived: f64,
 }
 
+/// Person with a new template, before it replaces the one of the same number.
+#[derive(Debug)]
+struct Successor {
+    person: StreamPerson,
+    /// Arrival of its first message, seconds of the viewer's clock.
+    since: Option<f64>,
+}
+
 /// People by their number, and messages that wait for templates.
 #[derive(Debug, Default)]
 pub struct People {
     by_number: BTreeMap<u32, StreamPerson>,
+    successors: BTreeMap<u32, Successor>,
     waiting: VecDeque<Waiting>,
 }
 
@@ -60,19 +71,41 @@ impl People {
     }
 
     fn apply(&mut self, person: u32, is_motion: bool, bytes: &[u8], now: f64) -> Result<(), StreamError> {
-        let Some(person) = self.by_number.get_mut(&person) else {
+        let Some(shown) = self.by_number.get_mut(&person) else {
             return Err(StreamError::OtherTemplate { what: "message" });
         };
-        if is_motion { person.ingest_motion(bytes, now) } else { person.ingest_colors(bytes).map(drop) }
+        let result = ingest(shown, is_motion, bytes, now);
+        let Some(successor) = self.successors.get_mut(&person) else { return result };
+        match result {
+            // The rig has returned to the template before.
+            Ok(()) => drop(self.successors.remove(&person)),
+            Err(StreamError::OtherTemplate { .. }) => {
+                ingest(&mut successor.person, is_motion, bytes, now)?;
+                let waited = now - *successor.since.get_or_insert(now);
+                let is_ready = successor.person.is_moving() && successor.person.is_painted();
+                if is_ready || waited > PATIENCE_SECS {
+                    self.by_number.extend(self.successors.remove(&person).map(|successor| (person, successor.person)));
+                }
+            }
+            Err(error) => return Err(error),
+        }
+        Ok(())
     }
 
-    /// Sets the template of a person, and applies the messages that waited for it.
+    /// Sets the template of a person, and applies the messages that waited for it. A person who is shown with colours is replaced once
+    /// motion and the coarsest colours of the new template have arrived, or after two seconds.
     pub fn set_template(&mut self, person: u32, template: Arc<StreamTemplate>) {
         if self.by_number.len() >= MAX_PEOPLE && !self.by_number.contains_key(&person) {
             self.by_number.pop_first();
         }
         let hash = template.hash;
-        self.by_number.insert(person, StreamPerson::new(template));
+        let new = StreamPerson::new(template);
+        if self.by_number.get(&person).is_some_and(|shown| shown.is_moving() && shown.is_painted()) {
+            self.successors.insert(person, Successor { person: new, since: None });
+        } else {
+            self.by_number.insert(person, new);
+        }
+        self.successors.retain(|number, _| self.by_number.contains_key(number));
         let (ours, others) = std::mem::take(&mut self.waiting).into_iter().partition(|waiting| {
             waiting.person == person && stamp_of(&waiting.bytes).is_ok_and(|stamp| stamp.template == hash)
         });
@@ -110,6 +143,10 @@ impl People {
     pub fn iter(&self) -> impl Iterator<Item = (u32, &StreamPerson)> {
         self.by_number.iter().map(|(&number, person)| (number, person))
     }
+}
+
+fn ingest(person: &mut StreamPerson, is_motion: bool, bytes: &[u8], now: f64) -> Result<(), StreamError> {
+    if is_motion { person.ingest_motion(bytes, now) } else { person.ingest_colors(bytes).map(drop) }
 }
 
 #[cfg(test)]
@@ -162,11 +199,18 @@ mod tests {
         let (mut posed, person) = (Posed::default(), people.get_mut(3).unwrap());
         let colors = person.pose(&found, &mut posed);
         assert!(colors.iter().all(|c| (c[0] - 0.5).abs() < 0.05 && (c[2] - 0.1).abs() < 0.05), "{:?}", colors[0]);
-        // The rig takes another template for the same person.
-        let hash = other.template.hash;
+        // The rig takes another template for the same person, who is shown as before until its colours have arrived.
+        let (before, hash) = (hash, other.template.hash);
         assert_eq!(people.ingest(3, true, &motion(&other, 2, 0.0), 0.2), Ok(Ingested::Needs(hash)));
-        people.set_template(3, Arc::new(other.template));
-        assert_eq!(people.get(3).unwrap().motion_at(0.2, false).unwrap().stamp.template, hash);
+        people.set_template(3, Arc::new(other.template.clone()));
+        let shown = |people: &People| people.get(3).unwrap().motion_at(0.2, false).unwrap().stamp.template;
+        assert_eq!(shown(&people), before);
+        assert_eq!(people.ingest(3, true, &motion(&other, 3, 0.0), 0.3), Ok(Ingested::Applied));
+        assert_eq!(shown(&people), before);
+        let colors = ColorEncoder::new(&other, ColorSettings::default(), 7).encode(Stamp::default(), &[[0.1; 4]; 40]);
+        assert_eq!(people.ingest(3, false, &colors[0], 0.3), Ok(Ingested::Applied));
+        assert_eq!(shown(&people), hash);
+        assert_eq!(people.ingest(3, true, &motion(&other, 4, 0.0), 0.4), Ok(Ingested::Applied));
         // Damaged bytes are an error and keep what is there.
         people.ingest(3, true, b"FLM", 0.3).unwrap_err();
         people.ingest(9, false, &[], 0.3).unwrap_err();
@@ -197,6 +241,38 @@ mod tests {
         assert!(people.get(0).unwrap().motion_at(6.1, false).unwrap().root_translation[0] < 1.01);
         assert_eq!(people.ingest(0, true, &motion(&template, 400, 9.0), 6.2), Ok(Ingested::Applied));
         assert!((people.get(0).unwrap().motion_at(6.2, true).unwrap().root_translation[0] - 9.0).abs() < 1e-3);
+    }
+
+    #[test]
+    fn a_new_template_is_shown_without_its_colors_after_a_while_and_one_that_comes_back_at_once() {
+        let (first, second) = (person(1.0), person(2.0));
+        let mut people = People::default();
+        people.set_template(0, Arc::new(first.template.clone()));
+        let colors = ColorEncoder::new(&first, ColorSettings::default(), 7).encode(Stamp::default(), &[[0.1; 4]; 40]);
+        let ingest = |people: &mut People, of: &EncodedTemplate, frame: u64, now: f64| {
+            people.ingest(0, true, &motion(of, frame, 0.0), now).unwrap();
+            people.get(0).unwrap().motion_at(now, false).map(|motion| motion.stamp.template)
+        };
+        let [a, b] = [&first, &second].map(|of| Some(of.template.hash));
+        assert_eq!(ingest(&mut people, &first, 1, 0.0), a);
+        // A person without colours is replaced at once.
+        people.set_template(0, Arc::new(second.template.clone()));
+        assert_eq!(ingest(&mut people, &second, 2, 0.1), b);
+        people.set_template(0, Arc::new(first.template.clone()));
+        assert_eq!(ingest(&mut people, &first, 3, 0.2), a);
+        people.ingest(0, false, &colors[0], 0.2).unwrap();
+        // Colours do not come.
+        people.set_template(0, Arc::new(second.template.clone()));
+        assert_eq!(ingest(&mut people, &second, 4, 0.3), a);
+        assert_eq!(ingest(&mut people, &second, 5, 2.2), a);
+        assert_eq!(ingest(&mut people, &second, 6, 2.4), b);
+        // The rig returns to the template before.
+        people.set_template(0, Arc::new(first.template.clone()));
+        people.ingest(0, true, &motion(&first, 7, 0.0), 2.5).unwrap();
+        people.ingest(0, false, &colors[0], 2.5).unwrap();
+        people.set_template(0, Arc::new(second.template.clone()));
+        assert_eq!(ingest(&mut people, &first, 8, 2.6), a);
+        assert!(people.successors.is_empty());
     }
 
     #[test]

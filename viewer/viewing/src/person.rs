@@ -152,7 +152,7 @@ impl StreamPerson {
     /// Poses the person and returns its linear colours, one element per Gaussian each.
     pub fn pose(&mut self, motion: &Motion, posed: &mut Posed) -> Arc<Vec<[f32; 4]>> {
         self.template.pose(motion, posed);
-        if self.template.is_avatar() {
+        if self.template.has_colors() {
             // The light changes the colours in each pose.
             self.template.avatar_colors(posed, Arc::make_mut(&mut self.colors));
             return Arc::clone(&self.colors);
@@ -163,15 +163,27 @@ impl StreamPerson {
         Arc::clone(&self.colors)
     }
 
-    /// Poses the axes of an avatar's Gaussians. Returns false for a person of isotropic Gaussians.
-    pub fn pose_axes(&self, motion: &Motion, axes: &mut PosedAxes) -> bool {
-        self.template.pose_axes(motion, axes)
+    /// Poses the axes of an avatar's Gaussians, which [`Self::pose`] has put in `posed`. Returns false for a person of isotropic Gaussians.
+    pub fn pose_axes(&self, motion: &Motion, posed: &Posed, axes: &mut PosedAxes) -> bool {
+        self.template.pose_axes(motion, posed, axes)
     }
 
     /// Returns whether every part of the person has its colours, down to the finest layer.
     #[must_use]
     pub fn is_complete(&self) -> bool {
-        self.template.is_avatar() || (0..flyrig_stream::LAYERS).all(|layer| self.decoder.known(layer) >= 1.0)
+        self.template.has_colors() || (0..flyrig_stream::LAYERS).all(|layer| self.decoder.known(layer) >= 1.0)
+    }
+
+    /// Returns whether every part of the person has at least its coarsest colours.
+    #[must_use]
+    pub fn is_painted(&self) -> bool {
+        self.template.has_colors() || self.decoder.known(0) >= 1.0
+    }
+
+    /// Returns whether a motion has arrived.
+    #[must_use]
+    pub fn is_moving(&self) -> bool {
+        !self.motions.is_empty()
     }
 
     /// Returns the number of colour messages so far: an unchanged number means unchanged colours.

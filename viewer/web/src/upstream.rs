@@ -112,7 +112,7 @@ impl Link {
                 for person in people {
                     hub.template(person, hash, &bytes);
                     self.colors.remove(&person);
-                    if let Some(template) = template.as_ref().filter(|template| !template.is_avatar()) {
+                    if let Some(template) = template.as_ref().filter(|template| !template.has_colors()) {
                         self.colors.insert(person, ColorDecoder::new(template));
                     }
                 }

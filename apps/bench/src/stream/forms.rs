@@ -82,16 +82,19 @@ impl Form for StreamForm {
         // The inverse transform belongs to decoding; posing is timed by itself.
         let start = Start::now();
         person.template().pose(&received, &mut Posed::default());
+        let decode_ms = (all_ms - start.millis()).max(0.0);
+        let mut axes = PosedAxes::default();
+        let has_axes = person.pose_axes(&received, &posed, &mut axes);
         let pose_ms = start.millis();
         Ok(Coded {
             posed,
-            axes: None,
+            axes: has_axes.then_some(axes),
             colors: known,
             bytes: motion.len() + colors.iter().map(Vec::len).sum::<usize>(),
             motion_bytes: motion.len(),
             template_bytes: frame.template().bytes.len(),
             encode_ms,
-            decode_ms: (all_ms - pose_ms).max(0.0),
+            decode_ms,
             pose_ms,
         })
     }
@@ -129,7 +132,7 @@ impl Form for AvatarPoses {
         let start = Start::now();
         let (mut posed, mut axes) = (Posed::default(), PosedAxes::default());
         let colors = self.person.pose(&received, &mut posed);
-        let has_axes = self.person.pose_axes(&received, &mut axes);
+        let has_axes = self.person.pose_axes(&received, &posed, &mut axes);
         Ok(Coded {
             posed,
             axes: has_axes.then_some(axes),
@@ -206,7 +209,7 @@ impl Start {
         Self(Duration::new(now.tv_sec.unsigned_abs(), now.tv_nsec.unsigned_abs() as u32))
     }
 
-    fn millis(self) -> f64 {
+    fn millis(&self) -> f64 {
         1e3 * Self::now().0.saturating_sub(self.0).as_secs_f64()
     }
 }

@@ -208,15 +208,17 @@ impl PersonLearner {
         match change {
             Change::Keep => tracing::info!(%person, round, fitted, before, after, "the learnt person is no better"),
             Change::Prove => tracing::info!(%person, round, fitted, before, after, "the person can be learnt"),
-            Change::Adopt(avatar) => {
+            Change::Adopt { avatar, stream } => {
                 tracing::info!(%person, round, fitted, before, after, "the learnt person is adopted");
                 stages.count(VERSIONS_COUNT, 1);
                 stages.time("adoption", || subject.become_avatar(gpu, &avatar, BLENDED_SETS))?;
+                subject.set_stream(&stream);
             }
             Change::Drop => {
                 tracing::warn!(%person, round, before, after, "the person looks otherwise than was learnt, and is learnt anew");
                 stages.count(DROPPED_COUNT, 1);
                 subject.return_to_surface(gpu)?;
+                subject.prepare_stream()?;
                 self.forget();
             }
         }

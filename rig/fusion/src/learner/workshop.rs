@@ -6,17 +6,22 @@ use std::{
 };
 
 use flyrig_avatar::{Avatar, AvatarFitSettings, AvatarModel, KnownPoses, TrainingFrame};
-use flyrig_body::Template;
+use flyrig_body::{Skeleton, Template};
 use flyrig_fit::{Fit, FitSettings, TrainingView};
 use flyrig_gpu::GpuContext;
 use flyrig_renderer::HarmonicOrder;
+use flyrig_stream::EncodedTemplate;
 use flyrig_types::{CameraId, Rig};
 
 use super::{
     judge::{Compared, Judge},
     key_sets::{Choice, KeySet, is_held_back},
 };
-use crate::{error::FusionError, settings::session::SessionSettings, subject::surface::GraphedSurface};
+use crate::{
+    error::FusionError,
+    settings::session::SessionSettings,
+    subject::{avatar_stream::encode_tracked_avatar, surface::GraphedSurface},
+};
 
 /// Steps of a round in which a camera is left out, and of one with all cameras.
 const TRIAL_STEPS: u32 = 200;
@@ -72,8 +77,8 @@ pub(crate) enum Change {
     Keep,
     /// The new version is better in a camera that it was not fitted to; the next round fits it to all cameras.
     Prove,
-    /// The person becomes this avatar.
-    Adopt(Arc<Avatar>),
+    /// The person becomes an avatar, for which viewers get this template.
+    Adopt { avatar: Arc<Avatar>, stream: Arc<EncodedTemplate> },
     /// The avatar in use does not fit the person any more.
     Drop,
 }
@@ -102,6 +107,9 @@ pub(crate) struct Workshop {
     succeeded: bool,
     /// Whether a version was better in a camera that it was not fitted to.
     proven: bool,
+    /// Skeleton of the tracked person, and whether a graph deforms it.
+    skeleton: Skeleton,
+    is_deformed: bool,
     /// Cameras of the rig.
     cameras: Vec<CameraId>,
 }
@@ -119,6 +127,7 @@ impl Workshop {
             }
         };
         let cameras = rig.cameras.iter().map(|camera| camera.id.clone()).collect();
+        let skeleton = template.skeleton.clone();
         let judge = Judge::new(&gpu, (template, base), (&rig, &settings), stopped)?;
         Ok(Self {
             gpu,
@@ -135,6 +144,8 @@ impl Workshop {
             error_in_use: f64::INFINITY,
             succeeded: true,
             proven: in_use_is_known,
+            skeleton,
+            is_deformed: settings.tracking.options().is_some(),
             cameras,
         })
     }
@@ -255,21 +266,27 @@ impl Workshop {
         let (Some(surface), Some(found)) = (surface, found) else { return Ok(self.undecided()) };
         let in_use = old.unwrap_or(surface);
         let change = if found < BETTER * in_use.min(surface) {
-            if self.proven { Change::Adopt(new) } else { Change::Prove }
+            if self.proven { self.adopt(new)? } else { Change::Prove }
         } else if old.is_some_and(|old| surface < BETTER * old) {
             Change::Drop
         } else {
             Change::Keep
         };
         let verdict = Verdict { round: self.rounds, fitted: sets.seen.len(), errors: [in_use, found], change };
-        self.succeeded = matches!(verdict.change, Change::Adopt(_) | Change::Prove);
+        self.succeeded = matches!(verdict.change, Change::Adopt { .. } | Change::Prove);
         self.proven |= self.succeeded;
         match &verdict.change {
-            Change::Adopt(avatar) => (self.in_use, self.error_in_use) = (Some(Arc::clone(avatar)), found),
+            Change::Adopt { avatar, .. } => (self.in_use, self.error_in_use) = (Some(Arc::clone(avatar)), found),
             Change::Drop => self.in_use = None,
             Change::Keep | Change::Prove => {}
         }
         Ok(verdict)
+    }
+
+    /// Returns the change to a version, whose template is encoded here and not in the session's thread.
+    fn adopt(&self, avatar: Arc<Avatar>) -> Result<Change, FusionError> {
+        let stream = encode_tracked_avatar(&avatar, &self.skeleton, self.is_deformed)?;
+        Ok(Change::Adopt { avatar, stream: Arc::new(stream) })
     }
 
     /// Returns the result of a round whose camera has no view in the key sets that were held back.

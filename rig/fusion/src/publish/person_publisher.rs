@@ -1,6 +1,7 @@
 //! Encoding and publishing of the person stream, on a thread of its own.
 //!
-//! With `output.avatar` the template of the first person is the avatar itself, and every frame is a pose: no node translations, no colours.
+//! With `output.avatar` the template of the first person holds the avatar's colours, and every frame is a pose: no node translations, no
+//! colours.
 //! While a viewer subscribes, each frame set yields one [`PersonFrame`] per person. Motion is published before the colours, which take
 //! longer to encode. Templates are offered by their hash; viewers fetch each once, and the present colours with it.
 
@@ -47,7 +48,7 @@ pub struct PersonMessages {
     pub stamp: Stamp,
     /// Encoded motion.
     pub motion: Vec<u8>,
-    /// Encoded colours, one element per layer; all empty for an avatar.
+    /// Encoded colours, one element per layer; all empty where the template has them.
     pub colors: [Vec<u8>; LAYERS],
 }
 
@@ -87,7 +88,7 @@ impl PersonEncoder {
         Ok((self.stamp(frame), self.motion.encode(&frame.motion)?))
     }
 
-    /// Encodes the colours; all layers are empty for an avatar.
+    /// Encodes the colours; all layers are empty where the template has them.
     fn encode_colors(&mut self, frame: &PersonFrame) -> [Vec<u8>; LAYERS] {
         if frame.colors.is_empty() {
             return Default::default();
@@ -160,7 +161,7 @@ fn publish(publisher: &Publisher, encoders: &mut BTreeMap<u32, PersonEncoder>, f
         }
         let encoder = PersonEncoder::new(frame, ColorSettings::default(), epoch());
         let (hash, bytes) = (encoder.hash, template.bytes.clone().into());
-        if template.template.is_avatar() {
+        if template.template.has_colors() {
             publisher.offer_template(person, hash, bytes);
         } else {
             publisher.offer_template_with(person, hash, bytes, encoder.colors());

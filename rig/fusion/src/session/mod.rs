@@ -336,6 +336,7 @@ impl Session {
                     if let Some(learner) = self.learner.as_mut().filter(|_| is_first) {
                         learner.forget();
                         subject.return_to_start(&self.gpu)?;
+                        subject.prepare_stream()?;
                     }
                     subject.forget(&self.gpu)?;
                 }

@@ -10,6 +10,7 @@ use flyrig_types::Pose;
 use glam::{DVec3, Vec3};
 use wgpu::CommandEncoder;
 
+use super::avatar_stream::linear;
 use crate::error::FusionError;
 
 /// Avatar on the device, at each instant of a frame set.
@@ -106,6 +107,24 @@ impl AvatarFigure {
         if *left == 0 {
             self.change = None;
         }
+    }
+
+    /// Returns the avatar, hung on the session's graph; while a change of version goes on, the new one.
+    pub fn hung(&self) -> &Avatar {
+        // A version that replaces another hangs on the graph already.
+        if self.change.is_some() { &self.source } else { &self.avatar }
+    }
+
+    /// Reads back the linear RGB, 0..=1, and opacity 1 of each Gaussian as it was drawn last, without the terms of the view.
+    pub fn shown_colors(&self, gpu: &GpuContext) -> Result<Vec<[f32; 4]>, FusionError> {
+        let Some(Instant { drawn, .. }) = self.instants.first() else { return Ok(Vec::new()) };
+        let harmonics = drawn.harmonics.read(gpu)?;
+        let constants = harmonics.iter().step_by(self.avatar.parameters.order().coefficients());
+        let shown = |constant: &[f32; 4]| {
+            let [r, g, b] = linear(*constant);
+            [r, g, b, 1.0]
+        };
+        Ok(constants.map(shown).collect())
     }
 
     /// Returns the mean translations of the graph's nodes, canonical metres.

@@ -97,6 +97,19 @@ impl Geometry {
         self.figure.as_ref().map(|figure| figure.source())
     }
 
+    /// Returns that avatar, hung on the session's graph.
+    pub fn hung_avatar(&self) -> Option<&Avatar> {
+        self.figure.as_ref().map(|figure| figure.hung())
+    }
+
+    /// Reads back linear RGB and opacity of each Gaussian as it is drawn.
+    pub fn shown_colors(&self, gpu: &GpuContext) -> Result<Vec<[f32; 4]>, FusionError> {
+        match &self.figure {
+            Some(figure) => figure.shown_colors(gpu),
+            None => Ok(self.gaussians.color.read(gpu)?),
+        }
+    }
+
     /// Makes the person of an avatar that hangs on this surface's graph. Another avatar before it changes into it over `sets` updates.
     pub fn set_avatar(
         &mut self,

@@ -1,8 +1,9 @@
 //! One person: template, Gaussians on the GPU, deformation, colours and tracking quality.
 //!
 //! [`person`] has the [`Subject`] and its update, [`geometry`] the deformation and skinning, [`painter`] the colours. [`memory`] outlives
-//! the subject, [`stream_frame`] is what viewers get of it.
+//! the subject; viewers get [`stream_frame`] with templates of the surface or of [`avatar_stream`].
 
+pub(crate) mod avatar_stream;
 mod figure;
 mod geometry;
 pub(crate) mod inputs;
@@ -21,6 +22,7 @@ pub(crate) mod surface;
 pub(crate) mod track_watch;
 pub(crate) mod upright;
 
+pub use avatar_stream::encode_posed_avatar;
 pub use geometry::PROCESSOR_STAGE;
 pub use memory::PersonMemory;
 pub use person::{Observed, Subject};

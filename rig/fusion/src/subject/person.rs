@@ -24,6 +24,7 @@ use flyrig_types::{PersonId, Pose, Rig};
 use glam::{DVec3, Vec3};
 
 use super::{
+    avatar_stream::encode_tracked_avatar,
     geometry::Geometry,
     inputs::{InputImage, InputView, Inputs},
     instants::Instants,
@@ -68,8 +69,8 @@ pub(super) struct PersonShape {
     pub template: Template,
     /// Body below the clothes, and the clothes; `None` without any.
     undressed: Option<(Template, Outfit)>,
-    /// Template of the person stream, for viewers that draw the person themselves.
-    pub stream: Arc<EncodedTemplate>,
+    /// Template of the person stream, for viewers that draw the person themselves; `None` until [`Subject::prepare_stream`].
+    pub stream: Option<Arc<EncodedTemplate>>,
 }
 
 /// Pose and tracking quality over the frame sets.
@@ -101,7 +102,7 @@ pub struct Subject {
     /// Number of the shape, see [`crate::KnownPerson`].
     pub(crate) shape_number: u32,
     pub(super) shape: PersonShape,
-    /// Surface and its graph, where the person is learnt.
+    /// Surface of the body with its graph, where the person is learnt.
     pub(super) base: Option<Arc<GraphedSurface>>,
     /// Deformation graph as the networks see it.
     body_graph: BodyGraph,
@@ -138,10 +139,15 @@ impl Subject {
                 GraphedSurface { surface, graph }
             }
         };
-        Self::of_surface(gpu, id, (body, outfit), (Arc::new(base), avatar), (rig, settings))
+        let mut subject = Self::of_surface(gpu, id, (body, outfit), (Arc::new(base), avatar), (rig, settings))?;
+        subject.prepare_stream()?;
+        if !settings.body.learn {
+            subject.base = None;
+        }
+        Ok(subject)
     }
 
-    /// Creates a person with this surface, which is that of the dressed body.
+    /// Creates a person with this surface, which is that of the dressed body, and without a template of the person stream.
     pub(crate) fn of_surface(
         gpu: &GpuContext,
         id: PersonId,
@@ -154,7 +160,6 @@ impl Subject {
         let is_deformed = settings.tracking.options().is_some();
         let inset = is_deformed.then(|| surface.inset());
         let rendered = inset.as_ref().unwrap_or(surface);
-        let stream = encode_template(rendered, is_deformed.then_some(graph), &template.skeleton)?;
         let body_graph = BodyGraph::new(surface, graph)?;
         Ok(Self {
             id,
@@ -168,12 +173,8 @@ impl Subject {
                 (rig.cameras.len(), avatar.is_some()),
                 settings,
             )?,
-            shape: PersonShape {
-                template,
-                undressed: (!outfit.is_bare()).then_some((body, outfit)),
-                stream: Arc::new(stream),
-            },
-            base: settings.body.learn.then_some(base),
+            shape: PersonShape { template, undressed: (!outfit.is_bare()).then_some((body, outfit)), stream: None },
+            base: Some(base),
             body_graph,
             inputs: Inputs::default(),
             schedule: Schedule::default(),
@@ -374,7 +375,7 @@ impl Subject {
         self.geometry.report()
     }
 
-    /// Reads back the colours for the person stream; `None` before the first pose.
+    /// Reads back the colours for the person stream; `None` before the first pose, and without a template.
     pub(crate) fn person_frame(
         &self,
         gpu: &GpuContext,
@@ -384,11 +385,34 @@ impl Subject {
         let Some(pose) = self.pose() else { return Ok(None) };
         let stamp = Stamp { person: self.id.0, frame, capture_nanos, ..Stamp::default() };
         let motion = Motion { stamp, ..motion(pose, self.node_translations()) };
-        let template = Arc::clone(&self.shape.stream);
-        if template.template.is_avatar() {
+        let Some(template) = self.shape.stream.clone() else { return Ok(None) };
+        if template.template.has_colors() {
             return Ok(Some(PersonFrame::of_pose(template, &motion)));
         }
-        Ok(Some(PersonFrame { template, motion, colors: self.gaussians().color.read(gpu)? }))
+        Ok(Some(PersonFrame { template, motion, colors: self.geometry.shown_colors(gpu)? }))
+    }
+
+    /// Encodes the template of the person stream, unless it is known. Takes some tenths of a second.
+    pub(crate) fn prepare_stream(&mut self) -> Result<(), FusionError> {
+        if self.shape.stream.is_some() {
+            return Ok(());
+        }
+        let (skeleton, is_deformed) = (&self.shape.template.skeleton, self.is_deformed());
+        let encoded = match (self.geometry.hung_avatar(), &self.base) {
+            (Some(avatar), _) => encode_tracked_avatar(avatar, skeleton, is_deformed)?,
+            (None, Some(base)) => {
+                let inset = is_deformed.then(|| base.surface.inset());
+                let graph = is_deformed.then_some(&base.graph);
+                encode_template(inset.as_ref().unwrap_or(&base.surface), graph, skeleton)?
+            }
+            (None, None) => return Ok(()),
+        };
+        self.shape.stream = Some(Arc::new(encoded));
+        Ok(())
+    }
+
+    fn is_deformed(&self) -> bool {
+        self.geometry.compared_gaussians() > 0
     }
 
     /// Reads back the Gaussians at the last update's time.

@@ -5,6 +5,7 @@ use std::sync::Arc;
 use flyrig_avatar::Avatar;
 use flyrig_gpu::GpuContext;
 use flyrig_renderer::Rasterizer;
+use flyrig_stream::EncodedTemplate;
 use flyrig_types::Pose;
 use glam::DVec3;
 
@@ -18,8 +19,8 @@ use super::{
 use crate::{error::FusionError, health::stage_times::StageTimes};
 
 impl Subject {
-    /// Makes the person of an avatar that hangs on its surface's graph; an earlier version changes into it over `sets` updates. Nothing
-    /// happens to a person who is not learnt.
+    /// Makes the person of an avatar that hangs on its surface's graph; an earlier version changes into it over `sets` updates. The
+    /// template of the person stream is forgotten. Nothing happens to a person who is not learnt.
     pub(crate) fn become_avatar(
         &mut self,
         gpu: &GpuContext,
@@ -29,6 +30,7 @@ impl Subject {
         let Some(base) = self.base.clone() else { return Ok(()) };
         let was_avatar = self.avatar().is_some();
         self.geometry.set_avatar(gpu, avatar, &base, sets)?;
+        self.forget_stream();
         if !was_avatar {
             self.painter.correct(true);
         }
@@ -39,8 +41,19 @@ impl Subject {
     pub(crate) fn return_to_surface(&mut self, gpu: &GpuContext) -> Result<(), FusionError> {
         let Some(base) = self.base.clone().filter(|_| self.avatar().is_some()) else { return Ok(()) };
         self.geometry.drop_avatar(gpu, &base)?;
+        self.forget_stream();
         self.painter.correct(false);
         Ok(())
+    }
+
+    /// Sets the template of the person stream, which was encoded elsewhere. One that poses alone drive stays.
+    pub(crate) fn set_stream(&mut self, template: &Arc<EncodedTemplate>) {
+        self.shape.stream.get_or_insert_with(|| Arc::clone(template));
+    }
+
+    /// Forgets the template of the person stream, unless poses alone drive it.
+    fn forget_stream(&mut self) {
+        self.shape.stream = self.shape.stream.take().filter(|stream| stream.template.has_colors());
     }
 
     /// Makes the person of what is known before the first image: an avatar, or the surface.

@@ -66,7 +66,7 @@ impl Subject {
     fn start_from(&mut self, start: Arc<PersonMemory>) {
         if let Some(avatar) = &start.stream {
             if avatar.template.joints().len() == self.shape.template.skeleton.joints().len() {
-                self.shape.stream = Arc::clone(avatar);
+                self.shape.stream = Some(Arc::clone(avatar));
             } else {
                 tracing::warn!("person {} has other joints than the avatar: viewers get surface and colours", self.id);
             }

@@ -1,7 +1,7 @@
 //! One frame of the person stream, read back from the GPU before it is encoded.
 //!
 //! A frame holds the person's pose, the canonical translations of the deformation graph's nodes and the Gaussians' colours. Viewers have
-//! the template already and skin it themselves. With an avatar the template holds the colours, and a frame is a pose alone.
+//! the template already and skin it themselves. Where the template holds the colours, a frame is a pose alone.
 
 use std::sync::Arc;
 
@@ -62,7 +62,7 @@ pub(crate) fn motion(pose: &Pose, translations: &[DVec3]) -> Motion {
 pub struct PersonFrame {
     pub(crate) template: Arc<EncodedTemplate>,
     pub(crate) motion: Motion,
-    /// Linear RGB and opacity of each Gaussian; empty for an avatar, whose template has the colours.
+    /// Linear RGB and opacity of each Gaussian; empty where the template has the colours.
     pub(crate) colors: Vec<[f32; 4]>,
 }
 

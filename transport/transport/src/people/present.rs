@@ -81,7 +81,7 @@ impl PresentPeople {
     pub fn decode_colors(&self, person: u32, template: &[u8]) {
         let Ok(template) = StreamTemplate::decode(template) else { return };
         let decoder = || Source::Decoded(Box::new(ColorDecoder::new(&template)));
-        self.set_source(person, if template.is_avatar() { Source::Template } else { decoder() });
+        self.set_source(person, if template.has_colors() { Source::Template } else { decoder() });
     }
 
     fn set_source(&self, person: u32, source: Source) {
