@@ -84,7 +84,7 @@ pub(crate) struct Influence<'a> {
 }
 
 /// Motion of one Gaussian from canonical space to the world.
-#[derive(Debug, Clone, Copy)]
+#[derive(Debug, Clone, Copy, Default)]
 struct Place {
     canonical: Vec3,
     linear: Mat3,
@@ -125,7 +125,14 @@ impl Avatar {
         let GaussianParameters { offset, shape, rotation, harmonics, .. } = &self.parameters;
         let nodes = self.hanging.as_ref();
         let translations = translations.or(nodes.map(|nodes| nodes.mean.as_slice())).unwrap_or_default();
-        let of = |i: usize| {
+        let count = self.places.len();
+        posed.center.resize(count, Element::default());
+        posed.scale_opacity.resize(count, Element::default());
+        posed.rotation.resize(count, Element::default());
+        posed.places.resize(count, Place::default());
+        let PosedAvatar { center, scale_opacity, rotation: turned, places, .. } = &mut *posed;
+        let rows = (center, scale_opacity, turned, places).into_par_iter().with_min_len(1024).enumerate();
+        rows.for_each(|(i, (center, scale_opacity, turned, place))| {
             let (blend, turn) = bones.blend(&self.skin[i]);
             let moved = nodes.map_or([0.0; 4], |hanging| {
                 displacement(&hanging.nodes, translations, hanging.gaussian_nodes[i], hanging.gaussian_weights[i])
@@ -134,23 +141,12 @@ impl Avatar {
             let [x, y, z, logit] = shape[i];
             let growth = 1.0 + moved[3];
             let [sx, sy, sz] = [x, y, z].map(|logarithm| growth * scale(logarithm));
-            let center = blend.transform_point3(canonical).extend(0.0).to_array();
-            let turned = turn * Quat::from_array(rotation[i]);
+            *center = blend.transform_point3(canonical).extend(0.0).to_array();
+            *scale_opacity = [sx, sy, sz, sigmoid(logit)];
+            *turned = (turn * Quat::from_array(rotation[i])).to_array();
             let normal = turn * self.attachments[i].blend(&self.template, &self.template.normals).normalize_or_zero();
-            let place = Place { canonical, linear: Mat3::from_mat4(blend), rotation: turn, growth, normal };
-            ((center, [sx, sy, sz, sigmoid(logit)]), (turned.to_array(), place))
-        };
-        let rows: Vec<_> = (0..self.places.len()).into_par_iter().with_min_len(1024).map(of).collect();
-        posed.center.clear();
-        posed.scale_opacity.clear();
-        posed.rotation.clear();
-        posed.places.clear();
-        for ((center, scales), (rotation, place)) in rows {
-            posed.center.push(center);
-            posed.scale_opacity.push(scales);
-            posed.rotation.push(rotation);
-            posed.places.push(place);
-        }
+            *place = Place { canonical, linear: Mat3::from_mat4(blend), rotation: turn, growth, normal };
+        });
         let coefficients = self.parameters.order().coefficients();
         posed.harmonics.clone_from(harmonics);
         posed.harmonics.par_chunks_mut(coefficients).zip(&posed.places).with_min_len(1024).for_each(|(rows, place)| {

@@ -1,5 +1,7 @@
 //! Avatar as the Gaussians of live tracking: their surface, and the same Gaussians hung on another deformation graph.
 
+use std::sync::Arc;
+
 use flyrig_body::{BodyError, DeformationGraph, SurfaceGaussians, attached_surface, displacement};
 use glam::{DVec3, Vec3, Vec4};
 
@@ -26,6 +28,17 @@ impl Avatar {
             mean: self.mean_on(graph),
         };
         Self { hanging: Some(hanging), ..self.clone() }
+    }
+
+    /// Returns this avatar where it hangs on `graph` already, else [`Self::hung_on`].
+    #[must_use]
+    pub fn shared_on(self: &Arc<Self>, graph: &DeformationGraph) -> Arc<Self> {
+        let hangs = self.hanging.as_ref().is_some_and(|hanging| {
+            hanging.nodes == graph.nodes
+                && hanging.gaussian_nodes == graph.gaussian_nodes
+                && hanging.gaussian_weights == graph.gaussian_weights
+        });
+        if hangs { Arc::clone(self) } else { Arc::new(self.hung_on(graph)) }
     }
 
     /// Returns the mean translations of the nodes of `graph`: those of the Gaussians at the nodes, where it is another graph
@@ -82,6 +95,8 @@ mod tests {
         let Hanging { nodes, .. } = avatar.hanging.as_ref().unwrap();
         assert_eq!(&graph.nodes, nodes, "the same graph");
         assert_eq!(avatar.hung_on(&graph), avatar);
+        let shared = Arc::new(avatar.clone());
+        assert!(Arc::ptr_eq(&shared, &shared.shared_on(&graph)));
         let broken = Avatar { skin: Vec::new(), ..avatar };
         assert!(broken.attached_surface().is_err());
     }
@@ -90,7 +105,7 @@ mod tests {
     fn on_another_graph_the_mean_shape_stays() {
         let avatar = dressed();
         let graph = build_graph(&avatar.template, &avatar.attached_surface().unwrap(), 90, DEFAULT_SIGMA2_M2).unwrap();
-        let hung = avatar.hung_on(&graph);
+        let hung = Arc::new(avatar.clone()).shared_on(&graph);
         assert_eq!(hung.hanging.as_ref().unwrap().mean.len(), 90);
         let bones = Bones::new(&avatar.template.skeleton, &random_pose(&avatar, 3).0);
         let (mut before, mut after) = (PosedAvatar::default(), PosedAvatar::default());

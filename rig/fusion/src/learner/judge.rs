@@ -49,29 +49,51 @@ impl<'a> Compared<'a> {
     }
 }
 
-/// Person that is made of one version after the other.
+/// Comparison of versions.
 #[derive(Debug)]
 pub(super) struct Judge {
     gpu: GpuContext,
-    subject: Subject,
-    rasterizer: Rasterizer,
-    target: Option<RenderTarget>,
+    template: Template,
+    base: Arc<GraphedSurface>,
+    rig: Rig,
+    settings: SessionSettings,
+    /// Held during a comparison: it takes as much memory as the person of a session.
+    stand_in: Option<StandIn>,
     /// Set when comparisons are to end early.
     stopped: Arc<AtomicBool>,
 }
 
+/// Person that is made of one version after the other.
+#[derive(Debug)]
+struct StandIn {
+    subject: Subject,
+    rasterizer: Rasterizer,
+    target: Option<RenderTarget>,
+}
+
 impl Judge {
-    /// Prepares a person with this surface.
+    /// Compares versions of a person with this surface.
     pub fn new(
         gpu: &GpuContext,
         (template, base): (Template, Arc<GraphedSurface>),
         (rig, settings): (&Rig, &SessionSettings),
         stopped: Arc<AtomicBool>,
-    ) -> Result<Self, FusionError> {
-        let worn = (template, Outfit::default());
-        let rasterizer = Rasterizer::new(gpu, base.surface.len())?;
-        let subject = Subject::of_surface(gpu, PersonId::default(), worn, (base, None), (rig, settings))?;
-        Ok(Self { gpu: gpu.clone(), subject, rasterizer, target: None, stopped })
+    ) -> Self {
+        let (rig, settings) = (rig.clone(), settings.clone());
+        Self { gpu: gpu.clone(), template, base, rig, settings, stand_in: None, stopped }
+    }
+
+    /// Frees the memory of comparisons until the next one.
+    pub fn rest(&mut self) {
+        self.stand_in = None;
+    }
+
+    fn stand_in(&self) -> Result<StandIn, FusionError> {
+        let (worn, base) = ((self.template.clone(), Outfit::default()), Arc::clone(&self.base));
+        let rasterizer = Rasterizer::new(&self.gpu, base.surface.len())?;
+        let with = (&self.rig, &self.settings);
+        let subject = Subject::of_surface(&self.gpu, PersonId::default(), worn, (base, None), with)?;
+        Ok(StandIn { subject, rasterizer, target: None })
     }
 
     /// Returns the mean error of a version in one camera's views that were held back, weighted as [`ErrorWeights`] say. The last of those
@@ -83,33 +105,43 @@ impl Judge {
         Compared { seen, held }: &Compared<'_>,
         camera: &CameraId,
     ) -> Result<Option<f64>, FusionError> {
+        let mut stand_in = match self.stand_in.take() {
+            Some(known) => known,
+            None => self.stand_in()?,
+        };
+        let StandIn { subject, .. } = &mut stand_in;
         match avatar {
-            Some(avatar) => self.subject.become_avatar(&self.gpu, avatar, 1)?,
-            None => self.subject.return_to_surface(&self.gpu)?,
+            Some(avatar) => subject.become_avatar(&self.gpu, avatar, 1)?,
+            None => subject.return_to_surface(&self.gpu)?,
         }
-        self.subject.forget_colors(&self.gpu);
+        subject.forget_colors(&self.gpu);
         let is_other = |view: &&KeyView| view.crop.camera().id != *camera;
         for set in &seen[seen.len().saturating_sub(REMEMBERED)..] {
             if self.stopped.load(Ordering::Relaxed) {
                 return Ok(None);
             }
-            self.paint(set, &set.pose, set.views.iter())?;
+            stand_in.paint(&self.gpu, set, &set.pose, set.views.iter())?;
         }
-        let memory = self.subject.memory(&self.gpu)?;
+        let memory = stand_in.subject.memory(&self.gpu)?;
         let (mut sum, mut count) = (0.0, 0);
         for set in held {
             let Some(view) = set.views.iter().find(|view| !is_other(view)) else { continue };
-            self.subject.show_colors(&self.gpu, &memory)?;
-            self.paint(set, view.pose.as_ref().unwrap_or(&set.pose), set.views.iter().filter(is_other))?;
-            sum += self.difference(view)?;
+            stand_in.subject.show_colors(&self.gpu, &memory)?;
+            let pose = view.pose.as_ref().unwrap_or(&set.pose);
+            stand_in.paint(&self.gpu, set, pose, set.views.iter().filter(is_other))?;
+            sum += stand_in.difference(&self.gpu, view)?;
             count += 1;
         }
+        self.stand_in = Some(stand_in);
         Ok((count > 0).then(|| sum / f64::from(count)))
     }
+}
 
+impl StandIn {
     /// Poses the person as in a key set, and paints it from views of it.
     fn paint<'a>(
         &mut self,
+        gpu: &GpuContext,
         set: &KeySet,
         pose: &Pose,
         views: impl Iterator<Item = &'a KeyView>,
@@ -128,21 +160,21 @@ impl Judge {
             .collect();
         // Times of comparisons are not those of the session's stages.
         let mut stages = StageTimes::default();
-        self.subject.paint_tracked(&self.gpu, &mut self.rasterizer, (pose, &set.translations), &views, &mut stages)
+        self.subject.paint_tracked(gpu, &mut self.rasterizer, (pose, &set.translations), &views, &mut stages)
     }
 
     /// Renders the person as a view shows it and returns the error.
-    fn difference(&mut self, view: &KeyView) -> Result<f64, FusionError> {
+    fn difference(&mut self, gpu: &GpuContext, view: &KeyView) -> Result<f64, FusionError> {
         let (camera, [width, height]) = (view.crop.camera(), view.crop.size());
         if self.target.as_ref().is_none_or(|target| (target.width, target.height) != (width, height)) {
-            self.target = Some(RenderTarget::new(&self.gpu, width, height)?);
+            self.target = Some(RenderTarget::new(gpu, width, height)?);
         }
         let Some(target) = &self.target else { return Ok(0.0) };
         let settings = RasterSettings { outputs: Outputs::COLOR, ..RasterSettings::default() };
-        let mut encoder = self.gpu.device.create_command_encoder(&Default::default());
-        self.rasterizer.encode(&self.gpu, &mut encoder, self.subject.drawn(), camera, &settings, target)?;
-        self.gpu.queue.submit([encoder.finish()]);
-        let pixels = target.color.read(&self.gpu)?;
+        let mut encoder = gpu.device.create_command_encoder(&Default::default());
+        self.rasterizer.encode(gpu, &mut encoder, self.subject.drawn(), camera, &settings, target)?;
+        gpu.queue.submit([encoder.finish()]);
+        let pixels = target.color.read(gpu)?;
         let weights = ErrorWeights::default();
         Ok(ImageDifference::of(&pixels, view.crop.photograph(), width as usize, &weights).loss)
     }

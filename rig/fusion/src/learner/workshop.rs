@@ -87,7 +87,8 @@ pub(crate) enum Change {
 #[derive(Debug)]
 pub(crate) struct Workshop {
     gpu: GpuContext,
-    avatar: Avatar,
+    /// Avatar as the last round left it; `None` during a round.
+    avatar: Option<Arc<Avatar>>,
     in_use: Option<Arc<Avatar>>,
     judge: Judge,
     /// Key sets by slot.
@@ -120,18 +121,18 @@ impl Workshop {
         let Beginning { gpu, rig, settings, template, base, colors, in_use, stopped } = beginning;
         let in_use_is_known = in_use.is_some();
         let avatar = match &in_use {
-            Some(avatar) => avatar.hung_on(&base.graph),
+            Some(avatar) => avatar.shared_on(&base.graph),
             None => {
                 let surface = base.surface.inset();
-                Avatar::new(&template, &surface, Some(&base.graph), &colors, HarmonicOrder::Zero)?
+                Arc::new(Avatar::new(&template, &surface, Some(&base.graph), &colors, HarmonicOrder::Zero)?)
             }
         };
         let cameras = rig.cameras.iter().map(|camera| camera.id.clone()).collect();
         let skeleton = template.skeleton.clone();
-        let judge = Judge::new(&gpu, (template, base), (&rig, &settings), stopped)?;
+        let judge = Judge::new(&gpu, (template, base), (&rig, &settings), stopped);
         Ok(Self {
             gpu,
-            avatar,
+            avatar: Some(avatar),
             in_use,
             judge,
             sets: BTreeMap::new(),
@@ -180,7 +181,9 @@ impl Workshop {
     pub fn work(&mut self) -> Result<Option<Verdict>, FusionError> {
         let Some(fit) = &mut self.fit else {
             if self.is_check_due() {
-                return self.check();
+                let verdict = self.check();
+                self.judge.rest();
+                return verdict;
             }
             if self.is_busy() {
                 self.begin()?;
@@ -194,8 +197,11 @@ impl Workshop {
             return Ok(None);
         }
         let Some(fit) = self.fit.take() else { return Ok(None) };
-        self.avatar = fit.into_model().into_avatar();
-        self.compare().map(Some)
+        let fitted = Arc::new(fit.into_model().into_avatar());
+        self.avatar = Some(Arc::clone(&fitted));
+        let verdict = self.compare(fitted);
+        self.judge.rest();
+        verdict.map(Some)
     }
 
     /// Returns the camera of this round's comparison; without a version that was proven, it is left out of the fit.
@@ -205,6 +211,7 @@ impl Workshop {
 
     /// Begins a round with the key sets that are not held back.
     fn begin(&mut self) -> Result<(), FusionError> {
+        let Some(avatar) = self.avatar.take() else { return Ok(()) };
         self.rounds += 1;
         let is_trial = !self.proven && self.cameras.len() >= LEAST_CAMERAS;
         let left_out = self.compared_camera().filter(|_| is_trial);
@@ -221,7 +228,8 @@ impl Workshop {
                 views.push(view.crop.clone().of_frame(own.unwrap_or(at_set)));
             }
         }
-        let mut avatar = self.avatar.clone();
+        // A version in use is needed as it is; any other becomes the model without a copy.
+        let mut avatar = Arc::unwrap_or_clone(avatar);
         avatar.set_mean(frames.iter().map(|frame| frame.translations.as_slice()));
         avatar.known_poses = KnownPoses::new(&frames.iter().map(|frame| frame.pose.clone()).collect::<Vec<_>>());
         let model = AvatarModel::new(avatar, frames, AvatarFitSettings::default());
@@ -254,15 +262,16 @@ impl Workshop {
     }
 
     /// Compares the fitted avatar with the person in use, on the newest key sets that were held back.
-    fn compare(&mut self) -> Result<Verdict, FusionError> {
+    fn compare(&mut self, new: Arc<Avatar>) -> Result<Verdict, FusionError> {
         self.unchecked = 0;
-        let new = Arc::new(self.avatar.clone());
         self.succeeded = false;
         let Some(camera) = self.compared_camera().cloned() else { return Ok(self.undecided()) };
         let sets = Compared::of(&self.sets);
         let mut error = |avatar| self.judge.error(avatar, &sets, &camera);
         let (surface, found) = (error(None)?, error(Some(&new))?);
         let old = self.in_use.as_ref().map(|avatar| error(Some(avatar))).transpose()?.flatten();
+        // Its memory is free for the template of the stream.
+        self.judge.rest();
         let (Some(surface), Some(found)) = (surface, found) else { return Ok(self.undecided()) };
         let in_use = old.unwrap_or(surface);
         let change = if found < BETTER * in_use.min(surface) {

@@ -2,7 +2,7 @@
 
 use std::sync::Arc;
 
-use flyrig_avatar::{Avatar, Bones, GaussianParameters, PosedAvatar};
+use flyrig_avatar::{Avatar, Bones, PosedAvatar};
 use flyrig_body::{DeformationGraph, Skeleton, SurfaceGaussians};
 use flyrig_gpu::{GpuContext, StorageBuffer};
 use flyrig_renderer::{AnisotropicBuffers, Corrected, GaussianBuffers, Recolor};
@@ -18,9 +18,9 @@ use crate::error::FusionError;
 pub(super) struct AvatarFigure {
     source: Arc<Avatar>,
     /// The avatar, hung on the session's graph.
-    avatar: Avatar,
-    /// Attributes that the avatar changes to, and the updates until it has them.
-    change: Option<(GaussianParameters, u32)>,
+    hung: Arc<Avatar>,
+    /// Avatar between the version before and this one, and the updates until it is this one.
+    between: Option<(Avatar, u32)>,
     canonical: Vec<[f32; 4]>,
     posed: PosedAvatar,
     recolor: Recolor,
@@ -49,13 +49,13 @@ impl AvatarFigure {
     ) -> Result<Self, FusionError> {
         let looks: Vec<[f32; 4]> = source.surface_colors(surface).into_iter().map(|[r, g, b]| [r, g, b, 1.0]).collect();
         gaussians.color.write(gpu, &looks);
-        let avatar = source.hung_on(graph);
-        let canonical: Vec<[f32; 4]> = avatar.centers().iter().map(|p| p.extend(1.0).to_array()).collect();
+        let hung = source.shared_on(graph);
+        let canonical: Vec<[f32; 4]> = hung.centers().iter().map(|p| p.extend(1.0).to_array()).collect();
         gaussians.canonical.write(gpu, &canonical);
         let corrections = StorageBuffer::zeroed(gpu, "colour corrections", canonical.len())?;
         let GaussianBuffers { center_scale, normal, canonical: positions, .. } = gaussians;
         Ok(Self {
-            recolor: Recolor::new(gpu, avatar.parameters.order()),
+            recolor: Recolor::new(gpu, hung.parameters.order()),
             painted: GaussianBuffers {
                 center_scale: center_scale.clone(),
                 normal: normal.clone(),
@@ -63,8 +63,8 @@ impl AvatarFigure {
                 canonical: positions.clone(),
             },
             source: Arc::clone(source),
-            avatar,
-            change: None,
+            hung,
+            between: None,
             canonical,
             posed: PosedAvatar::default(),
             look: StorageBuffer::from_slice(gpu, "looks of the surface", &looks)?,
@@ -77,7 +77,7 @@ impl AvatarFigure {
         &self.source
     }
 
-    /// Changes to another version of the avatar, on the same graph, over `sets` updates. The colours that the deformation compares, and
+    /// Changes to another version of the avatar, which hangs on the same graph, over `sets` updates. The colours that the deformation compares, and
     /// the light, change at once.
     pub fn change_to(
         &mut self,
@@ -94,32 +94,40 @@ impl AvatarFigure {
         for surface in self.instants.iter().filter_map(|instant| instant.drawn.surface.as_ref()) {
             surface.canonical.write(gpu, &self.canonical);
         }
-        let before = std::mem::replace(&mut self.avatar, (**source).clone());
-        self.change = Some((std::mem::replace(&mut self.avatar.parameters, before.parameters), sets.max(1)));
+        let before = match self.between.take() {
+            Some((avatar, _)) => avatar.parameters,
+            None => self.hung.parameters.clone(),
+        };
+        self.between = (sets > 1).then(|| (Avatar { parameters: before, ..(**source).clone() }, sets));
+        self.hung = Arc::clone(source);
         self.source = Arc::clone(source);
     }
 
     /// Goes on with a change of version by one update.
     fn go_on(&mut self) {
-        let Some((target, left)) = &mut self.change else { return };
-        self.avatar.parameters.approach(target, 1.0 / *left as f32);
+        let Some((avatar, left)) = &mut self.between else { return };
+        avatar.parameters.approach(&self.hung.parameters, 1.0 / *left as f32);
         *left -= 1;
         if *left == 0 {
-            self.change = None;
+            self.between = None;
         }
     }
 
     /// Returns the avatar, hung on the session's graph; while a change of version goes on, the new one.
     pub fn hung(&self) -> &Avatar {
-        // A version that replaces another hangs on the graph already.
-        if self.change.is_some() { &self.source } else { &self.avatar }
+        &self.hung
+    }
+
+    /// Returns the avatar that is drawn.
+    fn shown(&self) -> &Avatar {
+        self.between.as_ref().map_or(&self.hung, |(avatar, _)| avatar)
     }
 
     /// Reads back the linear RGB, 0..=1, and opacity 1 of each Gaussian as it was drawn last, without the terms of the view.
     pub fn shown_colors(&self, gpu: &GpuContext) -> Result<Vec<[f32; 4]>, FusionError> {
         let Some(Instant { drawn, .. }) = self.instants.first() else { return Ok(Vec::new()) };
         let harmonics = drawn.harmonics.read(gpu)?;
-        let constants = harmonics.iter().step_by(self.avatar.parameters.order().coefficients());
+        let constants = harmonics.iter().step_by(self.hung.parameters.order().coefficients());
         let shown = |constant: &[f32; 4]| {
             let [r, g, b] = linear(*constant);
             [r, g, b, 1.0]
@@ -129,7 +137,7 @@ impl AvatarFigure {
 
     /// Returns the mean translations of the graph's nodes, canonical metres.
     pub fn mean(&self) -> &[DVec3] {
-        self.avatar.hanging.as_ref().map_or(&[], |hanging| &hanging.mean)
+        self.hung.hanging.as_ref().map_or(&[], |hanging| &hanging.mean)
     }
 
     /// Returns the colours of the surface without corrections. Corrections follow the images wherever the surface slides; colours
@@ -160,7 +168,7 @@ impl AvatarFigure {
     ) -> Result<(), FusionError> {
         let count = self.canonical.len();
         while self.instants.len() <= instant {
-            let drawn = AnisotropicBuffers::zeroed(gpu, count, self.avatar.parameters.order())?.with_surface(gpu)?;
+            let drawn = AnisotropicBuffers::zeroed(gpu, count, self.hung.parameters.order())?.with_surface(gpu)?;
             if let Some(surface) = &drawn.surface {
                 surface.canonical.write(gpu, &self.canonical);
             }
@@ -170,7 +178,9 @@ impl AvatarFigure {
         if instant == 0 {
             self.go_on();
         }
-        self.avatar.pose(&Bones::new(skeleton, pose), translations, &mut self.posed);
+        let mut posed = std::mem::take(&mut self.posed);
+        self.shown().pose(&Bones::new(skeleton, pose), translations, &mut posed);
+        self.posed = posed;
         let PosedAvatar { center, scale_opacity, rotation, harmonics, .. } = &self.posed;
         let Instant { drawn, constant } = &self.instants[instant];
         let normals: Vec<[f32; 4]> = self.posed.normals().map(|normal| normal.extend(0.0).to_array()).collect();
@@ -188,7 +198,7 @@ impl AvatarFigure {
         if let Some(surface) = &drawn.surface {
             surface.normal.write(gpu, &normals);
         }
-        let coefficients = self.avatar.parameters.order().coefficients();
+        let coefficients = self.hung.parameters.order().coefficients();
         let constants: Vec<[f32; 4]> = harmonics.iter().step_by(coefficients).copied().collect();
         constant.write(gpu, &constants);
         self.recolor(gpu, encoder, instant, gaussians);
