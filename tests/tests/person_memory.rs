@@ -19,6 +19,12 @@ fn a_rig_resumes_the_person_that_it_saved() {
     assert_eq!(first.code, Some(0), "{}", first.stderr);
     let saved = std::fs::read(folder.path().join("me.person")).unwrap();
     assert!(saved.len() > 100_000 && !first.stderr.contains("resumed"), "{}", first.stderr);
+    // It has learnt no avatar.
+    let none = flyrig_tests::run(PROGRAM, &["avatar", "build", "me.person", "--out", "me.flyavatar"], folder.path());
+    let none = none.unwrap();
+    assert_eq!(none.code, Some(1));
+    assert!(none.stderr.contains("me.person holds no avatar yet"), "{}", none.stderr);
+    assert!(!folder.path().join("me.flyavatar").exists());
     let second = flyrig_tests::run(PROGRAM, &["run", "rig.toml"], folder.path()).unwrap();
     assert_eq!(second.code, Some(0), "{}", second.stderr);
     assert!(second.stderr.contains("the person is resumed from me.person"), "{}", second.stderr);

@@ -186,7 +186,9 @@ mod tests {
                 (PersonEncoder::new(&frame, ColorSettings::default(), 1), template, decoder)
             });
             let PersonMessages { motion, colors, .. } = encoder.encode(&frame).unwrap();
-            colors.iter().for_each(|layer| drop(decoder.ingest(layer).unwrap()));
+            for layer in &colors {
+                decoder.ingest(layer).unwrap();
+            }
             let motion = Motion::decode(&motion, template).unwrap();
             let (mut posed, mut axes, mut colors) = (Posed::default(), PosedAxes::default(), Vec::new());
             template.pose(&motion, &mut posed);

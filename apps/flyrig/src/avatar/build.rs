@@ -1,4 +1,4 @@
-//! `flyrig avatar build`: tracks the person of a take, then fits an avatar to its images.
+//! `flyrig avatar build`: tracks the person of a take, then fits an avatar to its images; or takes the avatar that a rig has learnt.
 
 use std::{
     path::{Path, PathBuf},
@@ -10,7 +10,7 @@ use clap::{Args, ValueEnum};
 use flyrig_avatar::{Avatar, AvatarFitSettings, AvatarModel, AvatarScene, Bones, Card, LocalSettings, TrainingFrame};
 use flyrig_body::DEFAULT_NODE_COUNT;
 use flyrig_fit::{Fit, FitSettings, Length, Run};
-use flyrig_fusion::BodySettings;
+use flyrig_fusion::{BodySettings, PersonMemory};
 use flyrig_gpu::GpuContext;
 use flyrig_renderer::HarmonicOrder;
 use flyrig_report::{arguments::parse_minutes, png, progress_bar, stop};
@@ -92,6 +92,9 @@ fn parse_pull(text: &str) -> Result<f32, String> {
 pub fn build(args: &AvatarBuildArgs, gpu: &GpuContext) -> Result<()> {
     let folder = args.out.parent().filter(|folder| !folder.as_os_str().is_empty()).unwrap_or(Path::new("."));
     ensure!(folder.is_dir(), "the folder {} does not exist; make it, or choose another --out", folder.display());
+    if args.take.dataset.extension().is_some_and(|extension| extension == "person") {
+        return save_learnt(&args.take.dataset, &args.out);
+    }
     let args = &AvatarBuildArgs { take: args.take.resolve("avatar build", &[], gpu)?, ..args.clone() };
     let AvatarTake { frames, views, avatar, uvs, numbers, camera } = track(args, gpu)?;
     let first = frames.first().cloned().context("no frame")?;
@@ -107,6 +110,20 @@ pub fn build(args: &AvatarBuildArgs, gpu: &GpuContext) -> Result<()> {
     }
     let fit = Fit::new(gpu, model, views, FitSettings { seed: args.seed, ..FitSettings::default() })?;
     Building::start(args, fit, preview)?.run(numbers)
+}
+
+/// Writes the avatar in a file of `body.person`.
+fn save_learnt(person: &Path, out: &Path) -> Result<()> {
+    let memory = PersonMemory::load(person)?;
+    let avatar = memory.avatar().with_context(|| {
+        format!(
+            "{} holds no avatar yet; let `flyrig run` go on with body.learn = true until it adopts one",
+            person.display()
+        )
+    })?;
+    avatar.save(out)?;
+    println!("{} holds the avatar that the rig has learnt: {} Gaussians", out.display(), avatar.gaussians());
+    Ok(())
 }
 
 /// Tracks the person of the take.
@@ -244,5 +261,31 @@ fn method(method: Method, local: &LocalSettings) -> String {
             let LocalSettings { group, stages, side, .. } = local;
             format!("logavatar: {group} Gaussians an anchor, {stages} stages, atlas uv of {side} texels")
         }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use std::sync::Arc;
+
+    use flyrig_body::{ShapeParams, default_template, sample_surface};
+
+    use super::*;
+
+    #[test]
+    fn the_avatar_that_a_rig_has_learnt_is_taken_from_its_file() {
+        let folder = tempfile::tempdir().unwrap();
+        let [person, out] = ["anna.person", "anna.flyavatar"].map(|name| folder.path().join(name));
+        let template = default_template(&ShapeParams::default()).unwrap();
+        let surface = sample_surface(&template, 300, 1).unwrap();
+        let avatar = Avatar::new(&template, &surface, None, &[], HarmonicOrder::Zero).unwrap();
+        PersonMemory::of_avatar(Arc::new(avatar.clone())).save(&person).unwrap();
+        save_learnt(&person, &out).unwrap();
+        assert_eq!(Avatar::load(&out).unwrap(), avatar);
+        std::fs::remove_file(&out).unwrap();
+
+        std::fs::write(&person, b"nothing").unwrap();
+        assert!(save_learnt(&person, &out).unwrap_err().to_string().contains("anna.person"));
+        assert!(!out.exists());
     }
 }
