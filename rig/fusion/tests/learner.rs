@@ -133,6 +133,10 @@ fn a_learnt_person_is_seen_better_by_another_camera_and_reruns_are_identical() {
     assert!(with < 0.8 * without, "{with}, without learning {without}");
     assert_eq!(count(&first, "versions of the person dropped"), 0);
     assert!(template_of_stream(&first).1, "viewers draw the avatar");
+    let progress = first.learning().unwrap();
+    assert_eq!(u64::from(progress.version), count(&first, "versions of the person adopted"));
+    assert_eq!(u64::from(progress.rounds), count(&first, "rounds of learning"));
+    assert!(progress.key_sets > 8 && progress.gain > Some(0.01) && progress.seconds > 0.0, "{progress:?}");
     let (_, second) = run(learning());
     assert_eq!(first.memory(ME).unwrap(), second.memory(ME).unwrap());
 
@@ -147,6 +151,7 @@ fn a_learnt_person_is_seen_better_by_another_camera_and_reruns_are_identical() {
     let error = show(&mut resumed, &avatar, 0, 15);
     let unlearnt = show(&mut session(gpu(), settings(4000), None), &avatar, 0, 15);
     assert!(resumed.memory(ME).unwrap().avatar().is_some());
+    assert!(resumed.learning().unwrap().version > 0);
     assert!(error < 0.8 * unlearnt, "{error} after it was resumed, {unlearnt} without learning");
 }
 
@@ -184,6 +189,7 @@ fn a_person_who_leaves_for_long_is_forgotten_and_a_thread_ends_with_its_session(
     show(&mut session, &avatar, 125, 136);
     assert!(session.memory(ME).unwrap().avatar().is_none(), "another person may have come");
     assert_eq!(template_of_stream(&session), (surface, false));
+    assert_eq!(session.learning().unwrap().version, 0);
 
     let mut beside = self::session(gpu(), learning(), None);
     beside.use_threads();

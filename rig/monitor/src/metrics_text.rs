@@ -153,6 +153,19 @@ impl Collector for Snapshot {
             page.gauge("budget_rate", "Requested frame sets per second.", budget.fps)?;
             page.gauge("set_seconds", "Smoothed cost of a set.", budget.set_secs)?;
         }
+        if let Some(learning) = health.learning {
+            page.gauge("learnt_version", "Version of the person in use; 0: its surface.", i64::from(learning.version))?;
+            page.gauge("learning_key_sets", "Sets that the person is learnt from.", i64::from(learning.key_sets))?;
+            page.counter("learning_rounds", "Rounds of fitting.", u64::from(learning.rounds))?;
+            page.gauge("learning_seconds", "Time of fitting and comparing.", learning.seconds)?;
+            if let Some(gain) = learning.gain {
+                page.gauge(
+                    "learnt_gain",
+                    "Share by which the version in use reduced the error when it was adopted.",
+                    gain,
+                )?;
+            }
+        }
         page.counter("device_faults", "Times that the graphics device was opened again.", health.device_faults)?;
         if let Some(mib) = health.resident_mib {
             page.gauge("resident_bytes", "Resident memory.", (mib * 1024.0 * 1024.0) as u64)?;
@@ -237,6 +250,11 @@ mod tests {
             "flyrig_effort_level 2",
             "flyrig_budget_rate 5.0",
             "flyrig_set_seconds 0.15",
+            "flyrig_learnt_version 2",
+            "flyrig_learning_key_sets 24",
+            "flyrig_learning_rounds_total 4",
+            "flyrig_learning_seconds 81.4",
+            "flyrig_learnt_gain 0.123",
             "flyrig_frames_overtaken_total{camera=\"le\\\"ft\"} 6",
             "flyrig_network_lost_total{camera=\"le\\\"ft\"} 8",
             "flyrig_host_clock_offset_seconds{camera=\"le\\\"ft\"} -1.5",

@@ -5,7 +5,7 @@ use std::fmt::Write as _;
 use flyrig_calib::WatchState;
 use flyrig_capture::Recorded;
 use flyrig_fusion::{CameraHealth, Health};
-use flyrig_transport::BudgetStats;
+use flyrig_transport::{BudgetStats, LearningStats};
 
 /// Returns the names of a rig's camera threads.
 pub fn threads(health: &Health) -> Vec<String> {
@@ -31,6 +31,16 @@ const SILENT_FROM_S: f64 = 5.0;
 pub fn silence_s(camera: &CameraHealth) -> Option<f64> {
     let is_open = camera.stats.running && camera.stats.opened;
     camera.quiet_s.filter(|quiet| is_open && *quiet >= SILENT_FROM_S.max(5e-3 * camera.interval_ms))
+}
+
+/// Formats the progress of learning.
+fn learnt(LearningStats { version, key_sets, rounds, seconds, gain }: LearningStats) -> String {
+    let version = match (version, gain) {
+        (0, _) => "no version yet".to_owned(),
+        (version, None) => format!("version {version}"),
+        (version, Some(gain)) => format!("version {version}, error {:.0} % lower", 100.0 * gain),
+    };
+    format!("{version}, {key_sets} key sets, {rounds} rounds in {seconds:.0} s")
 }
 
 /// Formats the level of effort with which a budget is kept.
@@ -92,6 +102,9 @@ pub fn table(health: &Health, recorded: Option<&Recorded>) -> String {
     if let Some(budget) = health.budget {
         let (fps, ms) = (budget.fps, 1e3 * budget.set_secs);
         let _ = writeln!(text, "budget: {fps} frame sets per second, {}, {ms:.0} ms each", effort(budget));
+    }
+    if let Some(learning) = health.learning {
+        let _ = writeln!(text, "learning: {}", learnt(learning));
     }
     for (thread, count) in thread_restarts(health).into_iter().filter(|(_, count)| *count > 0) {
         let _ = writeln!(text, "thread '{thread}': restarted {count} times");
@@ -166,6 +179,7 @@ pub mod tests {
             skipped_sets,
             stages: vec![stage],
             budget: Some(BudgetStats { fps: 5.0, level: 2, levels: 7, set_secs: 0.15 }),
+            learning: Some(LearningStats { version: 2, key_sets: 24, rounds: 4, seconds: 81.4, gain: Some(0.123) }),
             device_faults: 0,
             resident_mib,
         }
@@ -199,6 +213,13 @@ pub mod tests {
     }
 
     #[test]
+    fn learning_without_a_version_is_told() {
+        let none = LearningStats { key_sets: 3, ..LearningStats::default() };
+        assert_eq!(learnt(none), "no version yet, 3 key sets, 0 rounds in 0 s");
+        assert_eq!(learnt(LearningStats { version: 1, ..none }), "version 1, 3 key sets, 0 rounds in 0 s");
+    }
+
+    #[test]
     fn the_table_has_a_row_a_camera() {
         let table = table(&health(), None);
         let row = table.lines().nth(1).unwrap();
@@ -213,7 +234,8 @@ pub mod tests {
             last,
             [
                 "sets: 800 complete, 10 partial, 4 skipped",
-                "budget: 5 frame sets per second, effort 5 of 7, 150 ms each"
+                "budget: 5 frame sets per second, effort 5 of 7, 150 ms each",
+                "learning: version 2, error 12 % lower, 24 key sets, 4 rounds in 81 s"
             ]
         );
     }

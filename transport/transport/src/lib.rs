@@ -86,7 +86,7 @@ pub use publisher::{Publisher, ViewpointCounts};
 pub use report::{LatencyReport, TopicReport};
 pub use schema::SCHEMA_VERSION;
 pub use session::{config::TransportConfig, network_threads::use_one_network_thread};
-pub use stats::{BudgetStats, RigStats, StageStats, SubjectStats, TrackingStats, ViewRate};
+pub use stats::{BudgetStats, LearningStats, RigStats, StageStats, SubjectStats, TrackingStats, ViewRate};
 pub use subscriber::{Interests, Received, Subscriber, Views};
 pub use topic::{PublishOutcome, TopicCounts};
 pub use views::{

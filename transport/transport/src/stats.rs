@@ -93,6 +93,22 @@ pub struct BudgetStats {
     pub set_secs: f64,
 }
 
+/// Progress of a rig that learns its first person.
+#[derive(Debug, Clone, Copy, Default, PartialEq, Serialize, Deserialize)]
+pub struct LearningStats {
+    /// Number of the version that the person is made of; 0 while it is made of its surface.
+    pub version: u32,
+    /// Number of frame sets that it is learnt from, and compared on.
+    pub key_sets: u32,
+    /// Number of rounds of fitting.
+    pub rounds: u32,
+    /// Time of fitting and comparing, seconds.
+    pub seconds: f64,
+    /// Share by which the version in use reduced the error on images that it was not fitted to, when it was adopted; `None` before.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub gain: Option<f64>,
+}
+
 /// Statistics of the rig over its last interval of about a second.
 #[derive(Debug, Clone, Default, PartialEq, Serialize, Deserialize)]
 pub struct RigStats {
@@ -119,6 +135,9 @@ pub struct RigStats {
     /// Level of effort; `None` without a budget, and from older programs.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub budget: Option<BudgetStats>,
+    /// Progress of learning; `None` where no person is learnt, and from older programs.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub learning: Option<LearningStats>,
     /// Tracking quality of the first of `subjects`, for programs that know one person. [`Self::encode`] fills it in from `subjects`, or
     /// `subjects` from it where that is empty; [`Self::decode`] does so with messages of older programs.
     #[serde(default)]
@@ -145,6 +164,7 @@ impl RigStats {
         let finite = [self.uptime_secs, self.frames_per_second]
             .into_iter()
             .chain(self.measuring_secs)
+            .chain(self.learning.iter().flat_map(|learning| [Some(learning.seconds), learning.gain]).flatten())
             .chain(self.stages.iter().flat_map(|stage| [stage.mean_millis, stage.p95_millis]))
             .chain(self.views.iter().flat_map(|view| [view.per_second, view.bytes_per_second]))
             .all(f64::is_finite);

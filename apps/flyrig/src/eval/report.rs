@@ -3,6 +3,7 @@
 use flyrig_fusion::{AppearanceMode, Counts, Origin, Solver, StageSummary};
 use flyrig_metrics::{CameraScore, FrameScore};
 use flyrig_report::{ContactRow, Curve, Report};
+use flyrig_transport::LearningStats;
 use flyrig_types::CameraId;
 use serde::Serialize;
 
@@ -45,8 +46,23 @@ pub struct Metrics<'a> {
     verdicts: Vec<Verdict>,
     per_frame: &'a [FrameScore],
     counts: Counts,
+    /// Progress of `--learn`.
+    learning: Option<LearningStats>,
     sync: serde_json::Value,
     stages: Vec<StageSummary>,
+}
+
+/// Describes in words how far the person was learnt.
+fn learnt(LearningStats { version, key_sets, rounds, seconds, gain }: LearningStats) -> String {
+    let known = match (version, gain) {
+        (0, _) => "no version of the person was better than its surface".to_owned(),
+        (version, None) => format!("the person was version {version} at the end, as it was saved"),
+        (version, Some(gain)) => format!(
+            "the person was version {version} at the end, with an error {:.0} % lower than before on images it was not fitted to",
+            100.0 * gain
+        ),
+    };
+    format!("Learning: {known}; {rounds} rounds on {key_sets} key sets took {seconds:.0} s.")
 }
 
 impl<'a> Metrics<'a> {
@@ -76,6 +92,7 @@ impl<'a> Metrics<'a> {
             cameras,
             per_frame: evaluation.sheet.frames(),
             counts: first.replay.session.counts.clone(),
+            learning: first.replay.session.learning(),
             sync: first.replay.sync_summary(),
             stages: first.replay.session.stages.summary(),
         }
@@ -91,6 +108,7 @@ impl<'a> Metrics<'a> {
             ));
         }
         sentences.push(plan.method.clone());
+        sentences.extend(self.learning.map(learnt));
         sentences.extend(self.verdicts.iter().map(|verdict| verdict.words.clone()));
         let culprit = Culprit::find(&evaluation.without);
         sentences.extend(culprit.as_ref().map(Culprit::words));

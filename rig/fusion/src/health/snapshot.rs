@@ -5,7 +5,7 @@ use std::time::Duration;
 use flyrig_calib::WatchState;
 use flyrig_capture::CameraStats;
 use flyrig_sync::ClockState;
-use flyrig_transport::BudgetStats;
+use flyrig_transport::{BudgetStats, LearningStats};
 use flyrig_types::ThreadHealth;
 
 use super::stage_times::StageSummary;
@@ -64,6 +64,8 @@ pub struct Health {
     pub stages: Vec<StageSummary>,
     /// Level of effort; `None` without a budget.
     pub budget: Option<BudgetStats>,
+    /// Progress of learning; `None` where no person is learnt.
+    pub learning: Option<LearningStats>,
     /// Number of times that the graphics device was opened again after a fault.
     pub device_faults: u64,
     /// Resident memory of the process, MiB; `None` where the system does not report it.

@@ -217,6 +217,7 @@ impl Intake {
             skipped_sets: self.skipped_sets,
             stages: Vec::new(),
             budget: None,
+            learning: None,
             device_faults: 0,
             resident_mib: None,
         }

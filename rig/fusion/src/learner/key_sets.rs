@@ -70,6 +70,11 @@ impl KeySetChooser {
         self.kept.clear();
     }
 
+    /// Returns the number of key sets.
+    pub fn count(&self) -> usize {
+        self.kept.len()
+    }
+
     /// Returns the place in which a frame set of this time and pose is kept; `None` where it shows nothing new.
     pub fn choose(&mut self, skeleton: &Skeleton, pose: &Pose, nanos: i64) -> Option<Choice> {
         let joints: Vec<DVec3> = skeleton

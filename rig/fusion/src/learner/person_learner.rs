@@ -4,6 +4,7 @@ use std::sync::Arc;
 
 use flyrig_fit::TrainingView;
 use flyrig_gpu::GpuContext;
+use flyrig_transport::LearningStats;
 use flyrig_types::{Camera, ColorMatch, PersonId, Pose, Rig};
 
 use super::{
@@ -47,6 +48,7 @@ pub(crate) struct PersonLearner {
     of: Option<(PersonId, u32)>,
     chooser: KeySetChooser,
     place: Place,
+    progress: LearningStats,
 }
 
 /// Place of the work.
@@ -71,7 +73,13 @@ impl PersonLearner {
             of: None,
             chooser: KeySetChooser::default(),
             place: Place::Nowhere,
+            progress: LearningStats::default(),
         }
+    }
+
+    /// Returns the progress since the person is known.
+    pub fn progress(&self) -> LearningStats {
+        LearningStats { key_sets: self.chooser.count() as u32, ..self.progress }
     }
 
     /// Learns in a thread of its own from now on. Which frame set shows a new version first then depends on the machine.
@@ -81,7 +89,7 @@ impl PersonLearner {
 
     /// Forgets the person: another one may come, or the device was lost.
     pub fn forget(&mut self) {
-        (self.of, self.place) = (None, Place::Nowhere);
+        (self.of, self.place, self.progress) = (None, Place::Nowhere, LearningStats::default());
         self.chooser.clear();
     }
 
@@ -134,6 +142,8 @@ impl PersonLearner {
                 Place::Here(Box::new(Workshop::new(beginning)?))
             };
             self.of = Some(of);
+            // A saved person goes on with what was learnt.
+            self.progress.version = u32::from(subject.avatar().is_some());
         }
         let set = KeySet { choice, pose: pose.clone(), translations: subject.node_translations().to_vec(), views };
         let added = match &mut self.place {
@@ -202,8 +212,10 @@ impl PersonLearner {
         gpu: &GpuContext,
         stages: &mut StageTimes,
     ) -> Result<(), FusionError> {
-        let Verdict { change, round, fitted, errors: [before, after] } = verdict;
+        let Verdict { change, round, fitted, errors: [before, after], took } = verdict;
         stages.count(ROUNDS_COUNT, 1);
+        self.progress.rounds += 1;
+        self.progress.seconds += took.as_secs_f64();
         let person = subject.id();
         match change {
             Change::Keep => tracing::info!(%person, round, fitted, before, after, "the learnt person is no better"),
@@ -211,6 +223,8 @@ impl PersonLearner {
             Change::Adopt { avatar, stream } => {
                 tracing::info!(%person, round, fitted, before, after, "the learnt person is adopted");
                 stages.count(VERSIONS_COUNT, 1);
+                self.progress.version += 1;
+                self.progress.gain = Some(1.0 - after / before).filter(|gain| gain.is_finite());
                 stages.time("adoption", || subject.become_avatar(gpu, &avatar, BLENDED_SETS))?;
                 subject.set_stream(&stream);
             }

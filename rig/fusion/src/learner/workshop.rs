@@ -3,6 +3,7 @@
 use std::{
     collections::BTreeMap,
     sync::{Arc, atomic::AtomicBool},
+    time::{Duration, Instant},
 };
 
 use flyrig_avatar::{Avatar, AvatarFitSettings, AvatarModel, KnownPoses, TrainingFrame};
@@ -68,6 +69,8 @@ pub(crate) struct Verdict {
     pub fitted: usize,
     /// Error on the key sets that were held back, of the person in use and of the new version.
     pub errors: [f64; 2],
+    /// Time of the work since the last result.
+    pub took: Duration,
 }
 
 /// Change of the person after a round.
@@ -111,6 +114,8 @@ pub(crate) struct Workshop {
     /// Skeleton of the tracked person, and whether a graph deforms it.
     skeleton: Skeleton,
     is_deformed: bool,
+    /// Time of the work since the last result.
+    took: Duration,
     /// Cameras of the rig.
     cameras: Vec<CameraId>,
 }
@@ -147,6 +152,7 @@ impl Workshop {
             proven: in_use_is_known,
             skeleton,
             is_deformed: settings.tracking.options().is_some(),
+            took: Duration::ZERO,
             cameras,
         })
     }
@@ -179,6 +185,13 @@ impl Workshop {
     /// Begins a round, descends by one step, or ends the round with a comparison, which is returned. Between rounds, compares the version
     /// in use with newer images.
     pub fn work(&mut self) -> Result<Option<Verdict>, FusionError> {
+        let start = Instant::now();
+        let verdict = self.work_untimed();
+        self.took += start.elapsed();
+        verdict.map(|verdict| verdict.map(|verdict| Verdict { took: std::mem::take(&mut self.took), ..verdict }))
+    }
+
+    fn work_untimed(&mut self) -> Result<Option<Verdict>, FusionError> {
         let Some(fit) = &mut self.fit else {
             if self.is_check_due() {
                 let verdict = self.check();
@@ -252,8 +265,8 @@ impl Workshop {
         let (Some(surface), Some(in_use)) = (surface, in_use) else { return Ok(None) };
         if surface < BETTER * in_use {
             self.in_use = None;
-            let (round, fitted) = (self.rounds, sets.seen.len());
-            return Ok(Some(Verdict { round, fitted, errors: [in_use, surface], change: Change::Drop }));
+            let (round, fitted, took) = (self.rounds, sets.seen.len(), Duration::ZERO);
+            return Ok(Some(Verdict { round, fitted, errors: [in_use, surface], change: Change::Drop, took }));
         }
         if in_use > WORSE * self.error_in_use {
             self.succeeded = true;
@@ -281,7 +294,8 @@ impl Workshop {
         } else {
             Change::Keep
         };
-        let verdict = Verdict { round: self.rounds, fitted: sets.seen.len(), errors: [in_use, found], change };
+        let (round, fitted, took) = (self.rounds, sets.seen.len(), Duration::ZERO);
+        let verdict = Verdict { round, fitted, errors: [in_use, found], change, took };
         self.succeeded = matches!(verdict.change, Change::Adopt { .. } | Change::Prove);
         self.proven |= self.succeeded;
         match &verdict.change {
@@ -300,6 +314,7 @@ impl Workshop {
 
     /// Returns the result of a round whose camera has no view in the key sets that were held back.
     fn undecided(&self) -> Verdict {
-        Verdict { change: Change::Keep, round: self.rounds, fitted: 0, errors: [f64::NAN; 2] }
+        let took = Duration::ZERO;
+        Verdict { change: Change::Keep, round: self.rounds, fitted: 0, errors: [f64::NAN; 2], took }
     }
 }

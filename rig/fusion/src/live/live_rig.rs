@@ -319,6 +319,7 @@ impl LiveRig {
             resident_mib: resident_mib(),
             device_faults: self.recovery.rebuilt(),
             budget: self.session.budget.stats(),
+            learning: self.session.learning(),
             threads: std::iter::once(self.recovery.pipeline().clone()).chain(self.other_threads()).collect(),
             ..health
         }

@@ -227,6 +227,7 @@ impl LivePublisher {
             views,
             viewers: self.publisher.viewpoint_counts().active as u32,
             budget: session.budget.stats(),
+            learning: session.learning(),
             tracking: TrackingStats::default(),
             subjects: session.subjects().iter().map(stats_of).collect(),
             measuring_secs: session.measuring().map(|since| since.as_secs_f64()),

@@ -27,6 +27,7 @@ use std::{
 
 use flyrig_gpu::GpuContext;
 use flyrig_renderer::{Gaussians, RenderTarget, Splat};
+use flyrig_transport::LearningStats;
 use flyrig_types::{Camera, Frame, FrameSet, Image, PersonId, Pose, RenderedView, Rig, caught};
 
 use crate::{
@@ -104,6 +105,12 @@ impl Session {
     #[must_use]
     pub fn subject(&self, person: PersonId) -> Option<&Subject> {
         self.subjects.iter().find(|subject| subject.id() == person)
+    }
+
+    /// Returns the progress of learning; `None` without `body.learn`.
+    #[must_use]
+    pub fn learning(&self) -> Option<LearningStats> {
+        self.learner.as_ref().map(PersonLearner::progress)
     }
 
     /// Returns for how long a person has been seen who cannot be shown yet, because the shape is being measured; `None` while there is
