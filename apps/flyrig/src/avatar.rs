@@ -23,7 +23,8 @@ use self::inputs::load;
 /// Subcommands of `flyrig avatar`.
 #[derive(Debug, Subcommand)]
 pub enum AvatarAction {
-    /// Build the avatar of a person from a take: the person is tracked as live, then the avatar is fitted to all images together.
+    /// Build the avatar of a person from a take: the person is tracked as live, then the avatar is fitted to all images together. From a file of
+    /// body.person (*.person), take the avatar that a rig has learnt.
     Build(build::AvatarBuildArgs),
     /// Drive an avatar by the poses of a take, render the held-out cameras and score them.
     Eval(eval::AvatarEvalArgs),

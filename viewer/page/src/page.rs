@@ -136,7 +136,9 @@ impl Page {
             let Some(person) = self.people.get(number) else { continue };
             if let Some(motion) = person.motion_at(now, interpolate) {
                 // Interpolated motions share a frame number; the hash differs.
-                let key = (number, motion_key(&motion), person.color_changes());
+                // Another template with as many messages of colours has other colours.
+                let colors = person.color_changes().wrapping_add(person.template().hash);
+                let key = (number, motion_key(&motion), colors);
                 motions.push((key, motion));
             }
         }

@@ -57,7 +57,10 @@ impl People {
     /// [`StreamError`] for damaged bytes.
     pub fn ingest(&mut self, person: u32, is_motion: bool, bytes: &[u8], now: f64) -> Result<Ingested, StreamError> {
         match self.apply(person, is_motion, bytes, now) {
-            Ok(()) => Ok(Ingested::Applied),
+            Ok(()) => {
+                self.promote(person, now);
+                Ok(Ingested::Applied)
+            }
             Err(StreamError::OtherTemplate { .. }) => {
                 let template = stamp_of(bytes)?.template;
                 self.waiting.push_back(Waiting { person, is_motion, bytes: bytes.to_vec(), arrived: now });
@@ -70,40 +73,47 @@ impl People {
         }
     }
 
+    /// Applies a message to the person that is shown, or to its successor. Late messages of the former template are no return to it.
     fn apply(&mut self, person: u32, is_motion: bool, bytes: &[u8], now: f64) -> Result<(), StreamError> {
         let Some(shown) = self.by_number.get_mut(&person) else {
             return Err(StreamError::OtherTemplate { what: "message" });
         };
         let result = ingest(shown, is_motion, bytes, now);
-        let Some(successor) = self.successors.get_mut(&person) else { return result };
-        match result {
-            // The rig has returned to the template before.
-            Ok(()) => drop(self.successors.remove(&person)),
-            Err(StreamError::OtherTemplate { .. }) => {
-                ingest(&mut successor.person, is_motion, bytes, now)?;
-                let waited = now - *successor.since.get_or_insert(now);
-                let is_ready = successor.person.is_moving() && successor.person.is_painted();
-                if is_ready || waited > PATIENCE_SECS {
-                    self.by_number.extend(self.successors.remove(&person).map(|successor| (person, successor.person)));
-                }
-            }
-            Err(error) => return Err(error),
+        if !matches!(result, Err(StreamError::OtherTemplate { .. })) {
+            return result;
         }
+        if is_motion {
+            // The person is there, though not with this template.
+            shown.hold(now);
+        }
+        let Some(successor) = self.successors.get_mut(&person) else { return result };
+        ingest(&mut successor.person, is_motion, bytes, now)?;
+        successor.since.get_or_insert(now);
         Ok(())
     }
 
+    /// Lets a successor replace the person once it moves with colours, nobody is shown, or the colours are too late.
+    fn promote(&mut self, person: u32, now: f64) {
+        let Some(Successor { person: new, since: Some(since) }) = self.successors.get(&person) else { return };
+        let is_shown = self.by_number.get(&person).is_some_and(|shown| shown.motion_at(now, false).is_some());
+        if new.is_moving() && (new.is_painted() || !is_shown || now - since > PATIENCE_SECS) {
+            self.by_number.extend(self.successors.remove(&person).map(|successor| (person, successor.person)));
+        }
+    }
+
     /// Sets the template of a person, and applies the messages that waited for it. A person who is shown with colours is replaced once
-    /// motion and the coarsest colours of the new template have arrived, or after two seconds.
+    /// motion and the coarsest colours of the new template have arrived, or two seconds after its first motion.
     pub fn set_template(&mut self, person: u32, template: Arc<StreamTemplate>) {
         if self.by_number.len() >= MAX_PEOPLE && !self.by_number.contains_key(&person) {
             self.by_number.pop_first();
         }
         let hash = template.hash;
         let new = StreamPerson::new(template);
-        if self.by_number.get(&person).is_some_and(|shown| shown.is_moving() && shown.is_painted()) {
-            self.successors.insert(person, Successor { person: new, since: None });
-        } else {
-            self.by_number.insert(person, new);
+        match self.by_number.get(&person).filter(|shown| shown.is_moving() && shown.is_painted()) {
+            // Sent once more.
+            Some(shown) if shown.template().hash == hash => drop(self.successors.remove(&person)),
+            Some(_) => drop(self.successors.insert(person, Successor { person: new, since: None })),
+            None => drop(self.by_number.insert(person, new)),
         }
         self.successors.retain(|number, _| self.by_number.contains_key(number));
         let (ours, others) = std::mem::take(&mut self.waiting).into_iter().partition(|waiting| {
@@ -111,9 +121,15 @@ impl People {
         });
         self.waiting = others;
         let ours: VecDeque<Waiting> = ours;
+        let last = ours.back().map(|waiting| waiting.arrived);
         for waiting in ours {
             // A damaged message counts as lost.
             drop(self.apply(person, waiting.is_motion, &waiting.bytes, waiting.arrived));
+        }
+        if let (Some(last), Some(successor)) = (last, self.successors.get_mut(&person)) {
+            // What waited came before the template.
+            successor.since = Some(last);
+            self.promote(person, last);
         }
     }
 
@@ -266,13 +282,57 @@ mod tests {
         assert_eq!(ingest(&mut people, &second, 4, 0.3), a);
         assert_eq!(ingest(&mut people, &second, 5, 2.2), a);
         assert_eq!(ingest(&mut people, &second, 6, 2.4), b);
-        // The rig returns to the template before.
+        // Late messages of the template before keep neither it nor the new one from being shown.
         people.set_template(0, Arc::new(first.template.clone()));
         people.ingest(0, true, &motion(&first, 7, 0.0), 2.5).unwrap();
         people.ingest(0, false, &colors[0], 2.5).unwrap();
         people.set_template(0, Arc::new(second.template.clone()));
+        assert_eq!(ingest(&mut people, &second, 8, 2.6), a);
+        assert_eq!(people.ingest(0, false, &colors[1], 2.6), Ok(Ingested::Applied));
         assert_eq!(ingest(&mut people, &first, 8, 2.6), a);
+        let new = ColorEncoder::new(&second, ColorSettings::default(), 8).encode(Stamp::default(), &[[0.1; 4]; 40]);
+        people.ingest(0, false, &new[0], 2.7).unwrap();
+        assert_eq!(ingest(&mut people, &second, 9, 2.7), b);
         assert!(people.successors.is_empty());
+        // The same template once more changes nothing.
+        people.set_template(0, Arc::new(second.template.clone()));
+        assert_eq!(ingest(&mut people, &second, 10, 2.8), b);
+        assert!(people.successors.is_empty() && people.get(0).unwrap().is_painted());
+    }
+
+    #[test]
+    fn a_person_stands_still_while_a_template_is_fetched_and_one_who_is_gone_keeps_nobody_waiting() {
+        let (first, second) = (person(1.0), person(2.0));
+        let mut people = People::default();
+        people.set_template(0, Arc::new(first.template.clone()));
+        let colors = ColorEncoder::new(&first, ColorSettings::default(), 7).encode(Stamp::default(), &[[0.1; 4]; 40]);
+        people.ingest(0, true, &motion(&first, 1, 0.0), 0.0).unwrap();
+        people.ingest(0, false, &colors[0], 0.0).unwrap();
+        let shown = |people: &People, now: f64| {
+            people.get(0).unwrap().motion_at(now, false).map(|motion| motion.stamp.template)
+        };
+        let [a, b] = [&first, &second].map(|of| Some(of.template.hash));
+        // A slow line: the template takes eight seconds.
+        for tenth in 1..80 {
+            let now = 0.1 * f64::from(tenth);
+            assert!(matches!(
+                people.ingest(0, true, &motion(&second, 1 + tenth as u64, 0.0), now),
+                Ok(Ingested::Needs(_))
+            ));
+            assert_eq!(shown(&people, now), a, "{now}");
+        }
+        people.set_template(0, Arc::new(second.template.clone()));
+        assert_eq!(shown(&people, 8.0), a, "what waited is no reason to show it without colours");
+        people.ingest(0, true, &motion(&second, 90, 0.0), 8.1).unwrap();
+        assert_eq!(shown(&people, 8.1), a);
+        // Not for ever.
+        people.ingest(0, true, &motion(&person(3.0), 91, 0.0), 40.0).unwrap();
+        assert_eq!(shown(&people, 50.0), None);
+
+        // Somebody who has left comes back with another template.
+        people.set_template(0, Arc::new(second.template.clone()));
+        people.ingest(0, true, &motion(&second, 600, 0.0), 60.0).unwrap();
+        assert_eq!(shown(&people, 60.0), b);
     }
 
     #[test]

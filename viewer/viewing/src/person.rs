@@ -10,6 +10,8 @@ const KEPT: usize = 16;
 const MOST_DELAY_SECS: f64 = 0.5;
 /// Rate at which the estimate of the least latency follows a drifting clock, seconds per second.
 const DRIFT: f64 = 1e-3;
+/// Longest time for which a person is held while motion of a template comes that is on its way, seconds.
+const MOST_HELD_SECS: f64 = 30.0;
 /// Time without motion, in addition to three intervals, after which a person is gone.
 const GONE_AFTER_SECS: f64 = 3.0;
 
@@ -56,6 +58,8 @@ pub struct StreamPerson {
     color_changes: u64,
     /// Arrival by the viewer's clock, seconds, and motion.
     motions: VecDeque<(f64, Motion)>,
+    /// Last arrival of a motion of another template, seconds; see [`Self::hold`].
+    held: Option<f64>,
     /// Smoothed time between motions by the rig's clock, seconds.
     interval: f64,
     /// Least latency: arrival minus capture time, seconds.
@@ -72,6 +76,7 @@ impl StreamPerson {
             colors_are_current: false,
             color_changes: 0,
             motions: VecDeque::new(),
+            held: None,
             interval: 0.0,
             fastest: None,
             template,
@@ -113,6 +118,15 @@ impl StreamPerson {
         Ok(())
     }
 
+    /// Notes that a motion of a template that is on its way has arrived at `now`: unless the person is gone, its last motion is shown on,
+    /// for 30 s at most.
+    pub fn hold(&mut self, now: f64) {
+        let is_recent = self.motions.back().is_some_and(|(arrived, _)| now - arrived < MOST_HELD_SECS);
+        if is_recent && self.motion_at(now, false).is_some() {
+            self.held = Some(now);
+        }
+    }
+
     /// Ingests a layer of colours.
     ///
     /// # Errors
@@ -129,6 +143,7 @@ impl StreamPerson {
     #[must_use]
     pub fn motion_at(&self, now: f64, interpolate: bool) -> Option<Motion> {
         let (arrived, newest) = self.motions.back()?;
+        let arrived = self.held.map_or(*arrived, |held| held.max(*arrived));
         // A slow rig has long intervals.
         if now - arrived > GONE_AFTER_SECS + 3.0 * self.interval {
             return None;

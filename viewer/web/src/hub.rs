@@ -88,6 +88,15 @@ impl Browser {
         })
     }
 
+    /// Forgets what waits of a person, who gets another template.
+    fn forget(&mut self, person: u32) {
+        let is_other = |message: &Bytes| message.get(4..8) != Some(person.to_le_bytes().as_slice());
+        self.motions.remove(&person);
+        self.whole.retain(is_other);
+        self.colors.retain(is_other);
+        self.color_bytes = self.colors.iter().map(Bytes::len).sum();
+    }
+
     fn push_colors(&mut self, colors: Bytes) {
         if self.color_bytes + colors.len() > COLOR_BYTES && !self.colors.is_empty() {
             // Too slow for changes: the present state replaces them.
@@ -166,9 +175,15 @@ impl Hub {
         let bytes = message(Kind::Template, person, payload);
         let mut inner = self.lock();
         if inner.templates.len() < MAX_PEOPLE || inner.templates.contains_key(&person) {
-            inner.templates.insert(person, (hash, bytes.clone()));
+            let before = inner.templates.insert(person, (hash, bytes.clone()));
             inner.motions.remove(&person);
-            Self::to_all(&mut inner, |browser| drop(browser.templates.insert(person, bytes.clone())));
+            let is_another = before.is_some_and(|(before, _)| before != hash);
+            Self::to_all(&mut inner, |browser| {
+                if is_another {
+                    browser.forget(person);
+                }
+                browser.templates.insert(person, bytes.clone());
+            });
         }
     }
 
@@ -310,7 +325,14 @@ mod tests {
         hub.colors(3, b"c3");
         assert!(!hub.wants_whole());
         assert_eq!(drain(&late), [(3, 3, text(b"w0")), (3, 3, text(b"w1")), (3, 3, text(b"c3"))]);
+        // Of a template before nothing is sent after the new one.
         hub.motion(3, b"m4");
+        hub.colors(3, b"c4");
+        hub.colors(5, b"of somebody else");
+        hub.template(3, 8, b"t2");
+        hub.colors(3, b"c5");
+        assert_eq!(drain(&late), [(1, 3, text(b"t2")), (3, 5, text(b"of somebody else")), (3, 3, text(b"c5"))]);
+        hub.motion(3, b"m5");
         hub.forget_people();
         assert_eq!(drain(&late), [(5, 0, Vec::new())]);
         assert_eq!(hub.browsers(), 1);

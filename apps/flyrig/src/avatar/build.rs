@@ -93,6 +93,11 @@ pub fn build(args: &AvatarBuildArgs, gpu: &GpuContext) -> Result<()> {
     let folder = args.out.parent().filter(|folder| !folder.as_os_str().is_empty()).unwrap_or(Path::new("."));
     ensure!(folder.is_dir(), "the folder {} does not exist; make it, or choose another --out", folder.display());
     if args.take.dataset.extension().is_some_and(|extension| extension == "person") {
+        ensure!(
+            args.steps.is_none() && args.take.inputs.is_empty(),
+            "{} holds a finished avatar: leave out --steps and --inputs",
+            args.take.dataset.display()
+        );
         return save_learnt(&args.take.dataset, &args.out);
     }
     let args = &AvatarBuildArgs { take: args.take.resolve("avatar build", &[], gpu)?, ..args.clone() };

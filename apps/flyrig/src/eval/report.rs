@@ -55,7 +55,7 @@ pub struct Metrics<'a> {
 /// Describes in words how far the person was learnt.
 fn learnt(LearningStats { version, key_sets, rounds, seconds, gain }: LearningStats) -> String {
     let known = match (version, gain) {
-        (0, _) => "no version of the person was better than its surface".to_owned(),
+        (0, _) => "the person was made of its surface at the end".to_owned(),
         (version, None) => format!("the person was version {version} at the end, as it was saved"),
         (version, Some(gain)) => format!(
             "the person was version {version} at the end, with an error {:.0} % lower than before on images it was not fitted to",

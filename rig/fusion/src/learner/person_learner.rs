@@ -77,9 +77,11 @@ impl PersonLearner {
         }
     }
 
-    /// Returns the progress since the person is known.
-    pub fn progress(&self) -> LearningStats {
-        LearningStats { key_sets: self.chooser.count() as u32, ..self.progress }
+    /// Returns the progress. A person who was saved is version 1.
+    pub fn progress(&self, subject: Option<&Subject>) -> LearningStats {
+        let is_avatar = subject.is_some_and(|subject| subject.avatar().is_some());
+        let version = if is_avatar { self.progress.version.max(1) } else { 0 };
+        LearningStats { version, key_sets: self.chooser.count() as u32, ..self.progress }
     }
 
     /// Learns in a thread of its own from now on. Which frame set shows a new version first then depends on the machine.
@@ -87,9 +89,15 @@ impl PersonLearner {
         self.beside = true;
     }
 
-    /// Forgets the person: another one may come, or the device was lost.
+    /// Forgets the person: another one may come.
     pub fn forget(&mut self) {
-        (self.of, self.place, self.progress) = (None, Place::Nowhere, LearningStats::default());
+        (self.progress.version, self.progress.gain) = (0, None);
+        self.begin_again();
+    }
+
+    /// Begins again with the person as it is: the device was lost.
+    pub fn begin_again(&mut self) {
+        (self.of, self.place) = (None, Place::Nowhere);
         self.chooser.clear();
     }
 
@@ -142,8 +150,6 @@ impl PersonLearner {
                 Place::Here(Box::new(Workshop::new(beginning)?))
             };
             self.of = Some(of);
-            // A saved person goes on with what was learnt.
-            self.progress.version = u32::from(subject.avatar().is_some());
         }
         let set = KeySet { choice, pose: pose.clone(), translations: subject.node_translations().to_vec(), views };
         let added = match &mut self.place {
@@ -201,6 +207,10 @@ impl PersonLearner {
         }
         for verdict in verdicts {
             self.apply(verdict, subject, gpu, stages)?;
+            if self.of.is_none() {
+                // Later ones are of the version that was dropped.
+                break;
+            }
         }
         Ok(())
     }
@@ -223,7 +233,7 @@ impl PersonLearner {
             Change::Adopt { avatar, stream } => {
                 tracing::info!(%person, round, fitted, before, after, "the learnt person is adopted");
                 stages.count(VERSIONS_COUNT, 1);
-                self.progress.version += 1;
+                self.progress.version = self.progress(Some(subject)).version + 1;
                 self.progress.gain = Some(1.0 - after / before).filter(|gain| gain.is_finite());
                 stages.time("adoption", || subject.become_avatar(gpu, &avatar, BLENDED_SETS))?;
                 subject.set_stream(&stream);

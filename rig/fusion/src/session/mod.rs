@@ -110,7 +110,7 @@ impl Session {
     /// Returns the progress of learning; `None` without `body.learn`.
     #[must_use]
     pub fn learning(&self) -> Option<LearningStats> {
-        self.learner.as_ref().map(PersonLearner::progress)
+        self.learner.as_ref().map(|learner| learner.progress(self.subjects.first()))
     }
 
     /// Returns for how long a person has been seen who cannot be shown yet, because the shape is being measured; `None` while there is
@@ -495,7 +495,7 @@ impl Session {
             subjects.push(subject);
         }
         self.newcomers.clear();
-        self.learner.iter_mut().for_each(PersonLearner::forget);
+        self.learner.iter_mut().for_each(PersonLearner::begin_again);
         (self.gpu, self.view_renderer, self.subjects) = (gpu, view_renderer, subjects);
         Ok(())
     }

@@ -77,19 +77,20 @@ impl AvatarFigure {
         &self.source
     }
 
-    /// Changes to another version of the avatar, which hangs on the same graph, over `sets` updates. The colours that the deformation compares, and
+    /// Changes to another version of the avatar, of the same surface and graph, over `sets` updates. The colours that the deformation compares, and
     /// the light, change at once.
     pub fn change_to(
         &mut self,
         gpu: &GpuContext,
         source: &Arc<Avatar>,
-        surface: &SurfaceGaussians,
+        (surface, graph): (&SurfaceGaussians, &DeformationGraph),
         gaussians: &GaussianBuffers,
         sets: u32,
     ) {
         let looks: Vec<[f32; 4]> = source.surface_colors(surface).into_iter().map(|[r, g, b]| [r, g, b, 1.0]).collect();
         self.look.write(gpu, &looks);
-        self.canonical = source.centers().iter().map(|p| p.extend(1.0).to_array()).collect();
+        let hung = source.shared_on(graph);
+        self.canonical = hung.centers().iter().map(|p| p.extend(1.0).to_array()).collect();
         gaussians.canonical.write(gpu, &self.canonical);
         for surface in self.instants.iter().filter_map(|instant| instant.drawn.surface.as_ref()) {
             surface.canonical.write(gpu, &self.canonical);
@@ -98,8 +99,8 @@ impl AvatarFigure {
             Some((avatar, _)) => avatar.parameters,
             None => self.hung.parameters.clone(),
         };
-        self.between = (sets > 1).then(|| (Avatar { parameters: before, ..(**source).clone() }, sets));
-        self.hung = Arc::clone(source);
+        self.between = (sets > 1).then(|| (Avatar { parameters: before, ..(*hung).clone() }, sets));
+        self.hung = hung;
         self.source = Arc::clone(source);
     }
 

@@ -120,7 +120,7 @@ impl Geometry {
     ) -> Result<(), FusionError> {
         let GraphedSurface { surface, graph } = base;
         match &mut self.figure {
-            Some(figure) => figure.change_to(gpu, avatar, surface, &self.gaussians, sets),
+            Some(figure) => figure.change_to(gpu, avatar, (surface, graph), &self.gaussians, sets),
             none => {
                 *none = Some(Box::new(AvatarFigure::new(gpu, avatar, (surface, graph), &self.gaussians)?));
             }

@@ -59,6 +59,7 @@ impl Subject {
     /// Makes the person of what is known before the first image: an avatar, or the surface.
     pub(crate) fn return_to_start(&mut self, gpu: &GpuContext) -> Result<(), FusionError> {
         match self.start.as_ref().and_then(|start| start.avatar.clone()) {
+            Some(avatar) if self.avatar().is_some_and(|known| Arc::ptr_eq(known, &avatar)) => Ok(()),
             Some(avatar) => self.become_avatar(gpu, &avatar, 1),
             None => self.return_to_surface(gpu),
         }

@@ -38,7 +38,7 @@ pub const TARGETS: [Target; 12] = [
     Target { name: "network-frame", words: &["FLYR"], run: network_frame },
     Target { name: "splats", words: &[], run: splats },
     Target { name: "ply", words: PLY_WORDS, run: ply },
-    Target { name: "stream", words: &["FLT", "FLA", "FLM", "FLC", "cameras", "world_up", "1e999"], run: stream },
+    Target { name: "stream", words: &["FLT", "FLA", "FLE", "FLM", "FLC", "cameras", "world_up", "1e999"], run: stream },
     Target {
         name: "motion",
         words: &["JOINT", "OFFSET", "CHANNELS", "End Site", "MOTION", "Frames:", "{", "}"],
