@@ -52,7 +52,7 @@ const TLS_HANDSHAKE: u8 = 22;
 /// Largest request, bytes; the smallest bound that hyper takes.
 const REQUEST_BYTES: usize = 8192;
 /// Time limit from the connection to the end of the answer: the largest file at 32 kB/s, a hundredth of what the stream needs.
-const LONGEST: Duration = Duration::from_secs(11);
+const LONGEST: Duration = Duration::from_secs(12);
 /// Largest number of connections at a time, browsers included; further ones end those that show no token.
 const CONNECTIONS: usize = 512;
 /// Headers of every answer: the page loads nothing from elsewhere, and no other page frames it.
