@@ -77,8 +77,8 @@ impl AvatarFigure {
         &self.source
     }
 
-    /// Changes to another version of the avatar, of the same surface and graph, over `sets` updates. The colours that the deformation compares, and
-    /// the light, change at once.
+    /// Changes to another version of the avatar, of the same surface and graph, over `sets` updates. The colours that the deformation
+    /// compares, and the light, change at once.
     pub fn change_to(
         &mut self,
         gpu: &GpuContext,
