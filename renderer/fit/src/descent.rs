@@ -189,7 +189,8 @@ impl<M: Model> Fit<M> {
     /// Renders a view and compares it with its photograph.
     fn draw(&mut self, view: usize) -> Result<ImageDifference, FitError> {
         let view = &self.views[view];
-        let [center, scale_opacity, rotation, harmonics] = self.model.place(view.frame);
+        let [center, scale_opacity, rotation, harmonics] =
+            self.model.place(view.frame, view.camera.position().as_vec3());
         self.gaussians.center.write(&self.gpu, center);
         self.gaussians.scale_opacity.write(&self.gpu, scale_opacity);
         self.gaussians.rotation.write(&self.gpu, rotation);
@@ -199,8 +200,7 @@ impl<M: Model> Fit<M> {
             Entry::Occupied(entry) => entry.into_mut(),
             Entry::Vacant(entry) => entry.insert(Targets::new(&self.gpu, size)?),
         };
-        let settings =
-            RasterSettings { outputs: Outputs { canonical: false, ..Outputs::ALL }, ..RasterSettings::default() };
+        let settings = RasterSettings { outputs: Outputs::COLOR, ..RasterSettings::default() };
         let mut encoder = self.gpu.device.create_command_encoder(&Default::default());
         self.rasterizer.encode(&self.gpu, &mut encoder, &self.gaussians, &view.camera, &settings, rendered)?;
         self.gpu.queue.submit([encoder.finish()]);

@@ -1,6 +1,7 @@
 //! Interface between a fit and the model that is fitted.
 
 use flyrig_renderer::HarmonicOrder;
+use glam::Vec3;
 
 /// Row of every list of attributes: four numbers.
 pub type Element = [f32; 4];
@@ -28,8 +29,9 @@ pub trait Model {
     /// Returns the number of frames that Gaussians can be placed in.
     fn frames(&self) -> usize;
 
-    /// Places the Gaussians in the world at a frame and returns centres, scales with opacities, rotations and colours.
-    fn place(&mut self, frame: usize) -> [&[Element]; 4];
+    /// Places the Gaussians in the world at a frame and returns centres, scales with opacities, rotations and colours, for an image that is
+    /// seen from `eye`, world metres. Gaussians of opacity 0 are not drawn and have no derivatives.
+    fn place(&mut self, frame: usize, eye: Vec3) -> [&[Element]; 4];
 
     /// Moves the parameters by one step, from the derivatives with respect to the lists that [`Self::place`] returned
     /// last, for the same frame. Derivatives may be changed; those that are not finite count as zero.

@@ -38,11 +38,18 @@ impl Neighbors {
     /// Adds the derivatives of a pull to the mean of the neighbours: `weights` times the difference, per column. A
     /// Gaussian has `stride` rows, of which the first is pulled.
     pub fn pull(&self, values: &[Element], slopes: &mut [Element], stride: usize, weights: Element) {
+        if weights.iter().all(|weight| *weight == 0.0) {
+            return;
+        }
         slopes.par_chunks_mut(stride).zip(&self.0).enumerate().with_min_len(1024).for_each(|(i, (slope, nearest))| {
             let (Some(slope), Some(own)) = (slope.first_mut(), values.get(i * stride)) else { return };
+            let mut around = Element::default();
+            for &j in nearest {
+                let row = values.get(j as usize * stride).unwrap_or(own);
+                around.iter_mut().zip(row).for_each(|(sum, value)| *sum += value);
+            }
             for k in 0..4 {
-                let around = nearest.iter().map(|&j| values.get(j as usize * stride).map_or(own[k], |row| row[k]));
-                slope[k] += weights[k] * (own[k] - around.sum::<f32>() / NEAREST as f32);
+                slope[k] += weights[k] * (own[k] - around[k] / NEAREST as f32);
             }
         });
     }

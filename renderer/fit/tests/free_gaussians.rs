@@ -7,7 +7,7 @@ use flyrig_gpu::{GpuContext, testing::on_both};
 use flyrig_learn::ColumnAdam;
 use flyrig_renderer::{AnisotropicBuffers, HarmonicOrder, ViewPainter};
 use flyrig_types::{Camera, Intrinsics, Isometry};
-use glam::DVec3;
+use glam::{DVec3, Vec3};
 use rand::{RngExt as _, SeedableRng as _, rngs::StdRng};
 
 const SIZE: u32 = 64;
@@ -46,7 +46,7 @@ impl Model for Free {
         self.frames
     }
 
-    fn place(&mut self, _: usize) -> [&[Element]; 4] {
+    fn place(&mut self, _: usize, _: Vec3) -> [&[Element]; 4] {
         self.lists.0.each_ref().map(Vec::as_slice)
     }
 

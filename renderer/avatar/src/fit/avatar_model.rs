@@ -4,7 +4,7 @@ use flyrig_fit::{Element, Model, Neighbors, Step};
 use flyrig_learn::ColumnAdam;
 use flyrig_renderer::HarmonicOrder;
 use flyrig_types::Pose;
-use glam::{DVec3, Vec2};
+use glam::{DVec3, Vec2, Vec3};
 
 use crate::error::AvatarError;
 use crate::fit::pose_fit::PoseFit;
@@ -92,6 +92,8 @@ pub struct AvatarModel {
     settings: AvatarFitSettings,
     frames: Vec<TrainingFrame>,
     posed: PosedAvatar,
+    /// Scales and opacities of the Gaussians as the image's camera sees them.
+    facing: Vec<Element>,
     /// Bones of the frame that the Gaussians were placed in last.
     bones: Option<Bones>,
     moments: [ColumnAdam<4>; 4],
@@ -112,6 +114,7 @@ impl AvatarModel {
         let joints = avatar.template.skeleton.joints().len();
         Self {
             posed: PosedAvatar::default(),
+            facing: Vec::new(),
             bones: None,
             moments: avatar.parameters.lists().map(|list| ColumnAdam::new(list.len())),
             light: LightFit::new(),
@@ -195,15 +198,17 @@ impl Model for AvatarModel {
         self.frames.len()
     }
 
-    fn place(&mut self, frame: usize) -> [&[Element]; 4] {
+    fn place(&mut self, frame: usize, eye: Vec3) -> [&[Element]; 4] {
         if let (Some(pose), Some(TrainingFrame { translations, .. })) = (self.pose(frame), self.frames.get(frame)) {
             let bones = Bones::new(&self.avatar.template.skeleton, &pose);
             let translations = (!translations.is_empty()).then_some(translations.as_slice());
             self.avatar.pose(&bones, translations, &mut self.posed);
             self.bones = Some(bones);
         }
-        let PosedAvatar { center, scale_opacity, rotation, harmonics, .. } = &self.posed;
-        [center, scale_opacity, rotation, harmonics]
+        // As avatars are drawn.
+        self.posed.facing(eye, &mut self.facing);
+        let PosedAvatar { center, rotation, harmonics, .. } = &self.posed;
+        [center, &self.facing, rotation, harmonics]
     }
 
     fn descend(&mut self, frame: usize, slopes: &mut [Vec<Element>], step: Step) {

@@ -23,6 +23,7 @@ pub(crate) struct Harmonics<'a> {
 
 impl Harmonics<'_> {
     /// Returns the colour of Gaussian `i`; `None` where it is not finite.
+    #[inline(always)]
     pub fn color(&self, i: usize) -> Option<[f32; 4]> {
         let direction = (Vec4::from(self.center[i]).truncate() - self.eye).normalize_or(Vec3::Z);
         let color = unclamped_color(self.of(i), direction);
@@ -31,6 +32,7 @@ impl Harmonics<'_> {
 
     /// Adds the derivatives of Gaussian `i`, given dL/d its colour, to those with respect to its centre and its
     /// coefficients. A channel that is clamped at 0 contributes nothing.
+    #[inline(always)]
     pub fn add_backward(&self, i: usize, d_color: Vec3, center_out: &mut [f32; 4], harmonics_out: &mut [[f32; 4]]) {
         let coefficients = self.of(i);
         let sight = Vec4::from(self.center[i]).truncate() - self.eye;
@@ -51,12 +53,14 @@ impl Harmonics<'_> {
         }
     }
 
+    #[inline(always)]
     fn of(&self, i: usize) -> &[[f32; 4]] {
         &self.harmonics[i * self.coefficients..(i + 1) * self.coefficients]
     }
 }
 
 /// Evaluates the harmonics in the unit direction `d`.
+#[inline(always)]
 fn basis(d: Vec3) -> [f32; 9] {
     let Vec3 { x, y, z } = d;
     [
@@ -72,11 +76,13 @@ fn basis(d: Vec3) -> [f32; 9] {
     ]
 }
 
+#[inline(always)]
 fn unclamped_color(coefficients: &[[f32; 4]], d: Vec3) -> Vec3 {
     coefficients.iter().zip(basis(d)).map(|(c, value)| Vec4::from(*c).truncate() * value).sum()
 }
 
 /// Returns dL/d direction, including its part along the direction, given dL/d colour.
+#[inline(always)]
 fn direction_slope(coefficients: &[[f32; 4]], d: Vec3, d_color: Vec3) -> Vec3 {
     let by = |k: usize| coefficients.get(k).map_or(0.0, |c| d_color.dot(Vec4::from(*c).truncate()));
     let (xy, yz, zz) = (C2_XY * by(4), -C2_XY * by(5), 2.0 * C2_ZZ * by(6));

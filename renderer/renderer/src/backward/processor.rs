@@ -4,8 +4,6 @@
 
 mod project;
 
-use std::array::from_fn;
-
 use glam::{Vec3, Vec4};
 use rayon::prelude::*;
 
@@ -17,12 +15,14 @@ use crate::backward::target::GradientTarget;
 use crate::buffers::{GaussianBuffers, RenderTarget};
 use crate::raster::kernels::{MAX_ALPHA, OPAQUE};
 use crate::raster::processor::blend::{LOG2_CUT, TileLanes, exponents, is_opaque, rows_of};
-use crate::raster::processor::lanes::{LANES, Lanes, exp2, sum};
+use crate::raster::processor::lanes::{LANES, Lanes, exp2, sums as sums_of_lanes};
 use crate::raster::processor::project::{ProjectedSplat, TILE};
 use crate::raster::processor::rasterizer::{ProcessorRasterizer, RasterImage};
 use crate::raster::processor::shape::Shape;
 
 const ROWS: usize = TILE as usize;
+/// Index of the sum of weights in [`PairSum`].
+const WEIGHT: usize = 7;
 /// Gaussians per task of the projection's derivative.
 const CHUNK: usize = 1024;
 
@@ -103,14 +103,13 @@ impl ProcessorBackward {
                     }
                     let Some(state) = pixels.state(column, row) else { continue };
                     let range = lists.range(row * columns + column);
-                    *walked = flyrig_types::vectorized(TileBackward {
-                        state,
-                        origin: [(column * LANES) as f32, (row * ROWS) as f32],
-                        list: &lists.pairs[range.clone()],
-                        splats: &lists.splats,
-                        color,
-                        out: &mut part[range.start - first..range.end - first],
-                    });
+                    let (origin, list) = ([(column * LANES) as f32, (row * ROWS) as f32], &lists.pairs[range.clone()]);
+                    let (splats, out) = (&lists.splats[..], &mut part[range.start - first..range.end - first]);
+                    *walked = if pixels.only_colors() {
+                        flyrig_types::vectorized(TileBackward::<true> { state, origin, list, splats, color, out })
+                    } else {
+                        flyrig_types::vectorized(TileBackward::<false> { state, origin, list, splats, color, out })
+                    };
                 }
             },
         );
@@ -121,7 +120,9 @@ impl ProcessorBackward {
         for (tile, &walked) in self.walked.iter().enumerate().filter(|(_, walked)| **walked > 0) {
             let range = lists.range(tile);
             let range = range.start..range.start + walked as usize;
-            for (&gaussian, more) in lists.pairs[range.clone()].iter().zip(&self.pair_sums[range]) {
+            let pairs = lists.pairs[range.clone()].iter().zip(&self.pair_sums[range]);
+            // Without weight in any pixel all sums are 0.
+            for (&gaussian, more) in pairs.filter(|(_, sums)| sums[WEIGHT] != 0.0) {
                 let (sums, is_touched) = (&mut self.sums[gaussian as usize], &mut self.is_touched[gaussian as usize]);
                 sums.iter_mut().zip(more).for_each(|(sum, more)| *sum += more);
                 *is_touched = true;
@@ -171,17 +172,52 @@ impl ProcessorBackward {
         let ins = self.sums.par_chunks(CHUNK).zip(self.is_touched.par_chunks(CHUNK));
         outs.zip(ins).enumerate().for_each(
             |(chunk, ((((center_out, scale_out), rotation_out), harmonics_out), ins))| {
-                for at in (0..ins.0.len()).filter(|at| ins.1[*at]) {
-                    let (sums, i) = (&ins.0[at], chunk * CHUNK + at);
-                    let Some(shape) = Shape::new(&scale_opacity[i], &rotation[i]) else { continue };
-                    let out = [&mut center_out[at], &mut scale_out[at], &mut rotation_out[at]];
-                    add_anisotropic(rendered, sums, &center[i], &shape, out);
-                    let harmonics_out = &mut harmonics_out[at * coefficients..(at + 1) * coefficients];
-                    let d_color = Vec3::new(sums[8], sums[9], sums[10]);
-                    colors.add_backward(i, d_color, &mut center_out[at], harmonics_out);
-                }
+                flyrig_types::vectorized(CarryChunk {
+                    rendered,
+                    first: chunk * CHUNK,
+                    ins,
+                    scale_opacity: &scale_opacity[..],
+                    rotation: &rotation[..],
+                    colors,
+                    outs: [center_out, scale_out, rotation_out],
+                    harmonics_out,
+                });
             },
         );
+    }
+}
+
+/// Sums of a chunk of anisotropic Gaussians, to be carried to their attributes.
+struct CarryChunk<'a> {
+    rendered: &'a RasterImage,
+    /// Index of the chunk's first Gaussian.
+    first: usize,
+    ins: (&'a [PairSum], &'a [bool]),
+    scale_opacity: &'a [[f32; 4]],
+    rotation: &'a [[f32; 4]],
+    colors: Harmonics<'a>,
+    /// Derivatives of the chunk's centres, scales with opacities, and rotations.
+    outs: [&'a mut [[f32; 4]]; 3],
+    harmonics_out: &'a mut [[f32; 4]],
+}
+
+impl pulp::NullaryFnOnce for CarryChunk<'_> {
+    type Output = ();
+
+    #[inline(always)]
+    fn call(self) {
+        let Self { rendered, first, ins: (sums, is_touched), scale_opacity, rotation, colors, outs, harmonics_out } =
+            self;
+        let ([center_out, scale_out, rotation_out], coefficients) = (outs, colors.coefficients);
+        for at in (0..sums.len()).filter(|at| is_touched[*at]) {
+            let (sums, i) = (&sums[at], first + at);
+            let Some(shape) = Shape::new(&scale_opacity[i], &rotation[i]) else { continue };
+            let out = [&mut center_out[at], &mut scale_out[at], &mut rotation_out[at]];
+            add_anisotropic(rendered, sums, &colors.center[i], &shape, out);
+            let harmonics_out = &mut harmonics_out[at * coefficients..(at + 1) * coefficients];
+            let d_color = Vec3::new(sums[8], sums[9], sums[10]);
+            colors.add_backward(i, d_color, &mut center_out[at], harmonics_out);
+        }
     }
 }
 
@@ -212,6 +248,11 @@ struct State {
 }
 
 impl Pixels<'_> {
+    /// Returns whether the pixels have derivatives by colour alone, which are those that are carried.
+    fn only_colors(&self) -> bool {
+        self.carries_color && self.depth.is_none()
+    }
+
     /// Returns the incoming derivatives of a tile; `None` where no pixel has any.
     fn state(&self, column: usize, row: usize) -> Option<State> {
         const ZERO: TileLanes = [[0.0; LANES]; ROWS];
@@ -259,7 +300,9 @@ impl Pixels<'_> {
 
 /// Derivative of a tile's blending. The list is walked front to back again; the light from behind a splat is the
 /// finished pixel less what was blended so far. Writes the sum of each pair and returns the number of pairs walked.
-struct TileBackward<'a> {
+///
+/// With `ONLY_COLORS`, the pixels' derivatives are those of colours and coverage, and the carried ones those of colours.
+struct TileBackward<'a, const ONLY_COLORS: bool> {
     state: State,
     origin: [f32; 2],
     list: &'a [u32],
@@ -268,7 +311,7 @@ struct TileBackward<'a> {
     out: &'a mut [PairSum],
 }
 
-impl pulp::NullaryFnOnce for TileBackward<'_> {
+impl<const ONLY_COLORS: bool> pulp::NullaryFnOnce for TileBackward<'_, ONLY_COLORS> {
     type Output = u32;
 
     #[inline(always)]
@@ -276,11 +319,15 @@ impl pulp::NullaryFnOnce for TileBackward<'_> {
         let Self { mut state, origin, list, splats, color, out } = self;
         for (index, (&gaussian, out)) in list.iter().zip(out).enumerate() {
             let (splat, paint) = (&splats[gaussian as usize], &color[gaussian as usize]);
-            let mut sums = [[0.0; LANES]; 11];
+            let (mut moments, mut values) = ([[0.0; LANES]; LANES], [[0.0; LANES]; 3]);
             for row in rows_of(splat, origin[1]) {
-                state.add_row(splat, paint, origin, row, &mut sums);
+                state.add_row::<ONLY_COLORS>(splat, paint, origin, row, (&mut moments, &mut values));
             }
-            *out = from_fn(|i| sum(&sums[i]));
+            let moments = sums_of_lanes(&moments);
+            let [a, b, c] = values;
+            let [red, green, blue, ..] = sums_of_lanes(&[a, b, c, a, a, b, c, a]);
+            let [slope, slope_x, slope_y, by_depth, xx, xy, yy, weight] = moments;
+            *out = [slope, slope_x, slope_y, by_depth, xx, xy, yy, weight, red, green, blue];
             if index % LANES == LANES - 1 && is_opaque(&state.transmittance) {
                 return index as u32 + 1;
             }
@@ -292,13 +339,13 @@ impl pulp::NullaryFnOnce for TileBackward<'_> {
 impl State {
     /// Adds a splat's contribution in a row to its sums.
     #[inline(always)]
-    fn add_row(
+    fn add_row<const ONLY_COLORS: bool>(
         &mut self,
         splat: &ProjectedSplat,
         paint: &[f32; 4],
         origin: [f32; 2],
         row: usize,
-        sums: &mut [Lanes; 11],
+        (moments, values): (&mut [Lanes; LANES], &mut [Lanes; 3]),
     ) {
         let exponents = exponents(splat, origin, row);
         let (opaque, most) = (OPAQUE as f32, MAX_ALPHA as f32);
@@ -318,28 +365,29 @@ impl State {
             let clamped = if unclamped < most { unclamped } else { most };
             let alpha = if is_touched { clamped } else { 0.0 };
             let weight = alpha * transmittance;
-            let by_depth = self.by_depth[row][lane];
-            let value = self.color[0][row][lane] * paint[0]
-                + self.color[1][row][lane] * paint[1]
-                + self.color[2][row][lane] * paint[2]
-                + by_depth * (splat.depth - self.mean_depth[row][lane]);
+            let color = [0, 1, 2].map(|c| self.color[c][row][lane]);
+            let mut value = color[0] * paint[0] + color[1] * paint[1] + color[2] * paint[2];
+            if !ONLY_COLORS {
+                let by_depth = self.by_depth[row][lane];
+                value += by_depth * (splat.depth - self.mean_depth[row][lane]);
+                moments[3][lane] += weight * by_depth;
+            }
             let behind = self.behind[row][lane] - weight * value;
             self.behind[row][lane] = behind;
             let by_this_alpha = transmittance * value + (self.passing[row][lane] - behind) / (1.0 - alpha);
             // dL/d exponent; at the clamp alpha does not follow it.
             let slope = by_this_alpha * alpha * std::f32::consts::LN_2;
             let slope = if unclamped < most { slope } else { 0.0 };
-            sums[0][lane] += slope;
-            sums[1][lane] += slope * dx;
-            sums[2][lane] += slope * dy;
-            sums[3][lane] += weight * by_depth;
-            sums[4][lane] += slope * dx * dx;
-            sums[5][lane] += slope * dx * dy;
-            sums[6][lane] += slope * dy * dy;
-            sums[7][lane] += weight;
-            sums[8][lane] += weight * self.carried[0][row][lane];
-            sums[9][lane] += weight * self.carried[1][row][lane];
-            sums[10][lane] += weight * self.carried[2][row][lane];
+            moments[0][lane] += slope;
+            moments[1][lane] += slope * dx;
+            moments[2][lane] += slope * dy;
+            moments[4][lane] += slope * dx * dx;
+            moments[5][lane] += slope * dx * dy;
+            moments[6][lane] += slope * dy * dy;
+            moments[7][lane] += weight;
+            for (c, values) in values.iter_mut().enumerate() {
+                values[lane] += weight * if ONLY_COLORS { color[c] } else { self.carried[c][row][lane] };
+            }
             self.transmittance[row][lane] = transmittance * (1.0 - alpha);
         }
     }

@@ -12,7 +12,7 @@ use flyrig_avatar::Avatar;
 use flyrig_body::{Outfit, Template};
 use flyrig_fit::{ErrorWeights, ImageDifference};
 use flyrig_gpu::GpuContext;
-use flyrig_renderer::{Outputs, RasterSettings, Rasterizer, RenderTarget};
+use flyrig_renderer::{HarmonicOrder, Outputs, RasterSettings, Rasterizer, RenderTarget};
 use flyrig_types::{CameraId, Image, Mask, PersonId, PixelFormat, Pose, Rig};
 
 use super::key_sets::{KeySet, KeyView, is_held_back};
@@ -94,6 +94,22 @@ impl Judge {
         let with = (&self.rig, &self.settings);
         let subject = Subject::of_surface(&self.gpu, PersonId::default(), worn, (base, None), with)?;
         Ok(StandIn { subject, rasterizer, target: None })
+    }
+
+    /// Returns the surface of the person, painted from key sets without one of the cameras.
+    pub fn surface(
+        &mut self,
+        Compared { seen, .. }: &Compared<'_>,
+        without: Option<&CameraId>,
+    ) -> Result<Avatar, FusionError> {
+        let mut stand_in = self.stand_in()?;
+        for set in seen {
+            let views = set.views.iter().filter(|view| Some(&view.crop.camera().id) != without);
+            stand_in.paint(&self.gpu, set, &set.pose, views)?;
+        }
+        let colors: Vec<[f32; 3]> = stand_in.subject.splats(&self.gpu)?.iter().map(|splat| splat.color).collect();
+        let surface = self.base.surface.inset();
+        Ok(Avatar::new(&self.template, &surface, Some(&self.base.graph), &colors, HarmonicOrder::Zero)?)
     }
 
     /// Returns the mean error of a version in one camera's views that were held back, weighted as [`ErrorWeights`] say. The last of those
@@ -186,4 +202,69 @@ fn picture(view: &KeyView) -> Result<(Image, Mask), FusionError> {
     let rgb: Vec<u8> = rgba.chunks_exact(4).flat_map(|pixel| [pixel[0], pixel[1], pixel[2]]).collect();
     let mask = rgba.iter().skip(3).step_by(4).copied().collect();
     Ok((Image::new(width, height, PixelFormat::Rgb8, rgb)?, Mask::new(width, height, mask)?))
+}
+
+#[cfg(test)]
+mod tests {
+    use flyrig_body::{ShapeParams, default_template};
+    use flyrig_fit::TrainingView;
+    use flyrig_gpu::AdapterChoice;
+    use flyrig_types::{Camera, Intrinsics, Isometry, Lens};
+    use glam::{DVec2, DVec3};
+
+    use super::*;
+    use crate::{
+        learner::key_sets::Choice, person_surface, settings::body::BodySettings, settings::session::SessionSettings,
+    };
+
+    const SIZE: u32 = 96;
+
+    /// Camera in front of the person (1) or behind it (-1), whose image has one colour.
+    fn view(id: &str, side: f64, rgb: [u8; 3]) -> KeyView {
+        let middle = DVec3::new(0.0, 0.85, 0.0);
+        let intrinsics = Intrinsics {
+            width: SIZE,
+            height: SIZE,
+            focal_px: DVec2::splat(1.2 * f64::from(SIZE)),
+            center_px: DVec2::splat(0.5 * f64::from(SIZE) - 0.5),
+            lens: Lens::PINHOLE,
+        };
+        let camera = Camera {
+            time_offset_nanos: 0,
+            color: Default::default(),
+            id: id.into(),
+            intrinsics,
+            camera_from_world: Isometry::look_at(middle + DVec3::Z * (3.4 * side), middle, DVec3::Y),
+        };
+        let rgba = [rgb[0], rgb[1], rgb[2], 255].repeat((SIZE * SIZE) as usize);
+        KeyView { crop: TrainingView::cut(0, &camera, &rgba).unwrap(), pose: None }
+    }
+
+    /// A trial that began with the colours of the camera that it leaves out would be compared with what it knows.
+    #[test]
+    fn a_camera_that_is_left_out_paints_nothing() {
+        let gpu = GpuContext::new(&AdapterChoice::Best).unwrap();
+        let template = default_template(&ShapeParams::default()).unwrap();
+        let settings = SessionSettings { body: BodySettings::with_gaussians(2000), ..SessionSettings::default() };
+        let (surface, graph) = person_surface(&template, &settings.body).unwrap();
+        let views = vec![view("front", 1.0, [250, 0, 0]), view("back", -1.0, [0, 250, 0])];
+        let cameras = views.iter().map(|view| view.crop.camera().clone()).collect();
+        let rig = Rig { cameras, world_up: DVec3::Y };
+        let set = KeySet {
+            choice: Choice { slot: 0, is_new: true },
+            pose: template.skeleton.rest_pose(),
+            translations: vec![DVec3::ZERO; graph.nodes.len()],
+            views,
+        };
+        let base = Arc::new(GraphedSurface { surface, graph });
+        let mut judge = Judge::new(&gpu, (template, base), (&rig, &settings), Arc::default());
+        let sets = BTreeMap::from([(0, (1, set))]);
+        let mut red = |without: Option<&CameraId>| {
+            let colors = judge.surface(&Compared::of(&sets), without).unwrap().parameters.harmonics;
+            colors.iter().filter(|color| color[0] > color[1] + 0.1).count()
+        };
+        assert!(red(None) > 200, "the front is red");
+        assert_eq!(red(Some(&"front".into())), 0);
+        assert!(red(Some(&"back".into())) > 200);
+    }
 }

@@ -140,7 +140,6 @@ impl PersonLearner {
                 settings: settings.clone(),
                 template: subject.template().clone(),
                 base,
-                colors: subject.splats(gpu)?.iter().map(|splat| splat.color).collect(),
                 in_use: subject.avatar().cloned(),
                 stopped: Arc::default(),
             };

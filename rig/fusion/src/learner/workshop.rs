@@ -10,7 +10,6 @@ use flyrig_avatar::{Avatar, AvatarFitSettings, AvatarModel, KnownPoses, Training
 use flyrig_body::{Skeleton, Template};
 use flyrig_fit::{Fit, FitSettings, TrainingView};
 use flyrig_gpu::GpuContext;
-use flyrig_renderer::HarmonicOrder;
 use flyrig_stream::EncodedTemplate;
 use flyrig_types::{CameraId, Rig};
 
@@ -51,8 +50,6 @@ pub(crate) struct Beginning {
     pub settings: SessionSettings,
     pub template: Template,
     pub base: Arc<GraphedSurface>,
-    /// Linear RGB of each Gaussian as it is drawn now.
-    pub colors: Vec<[f32; 3]>,
     /// Avatar that the person is made of already.
     pub in_use: Option<Arc<Avatar>>,
     /// Set when comparisons are to end early.
@@ -78,7 +75,7 @@ pub(crate) struct Verdict {
 pub(crate) enum Change {
     /// The version in use is better.
     Keep,
-    /// The new version is better in a camera that it was not fitted to; the next round fits it to all cameras.
+    /// The new version is better on key sets that were held back, but was fitted to all cameras: another round must confirm it.
     Prove,
     /// The person becomes an avatar, for which viewers get this template.
     Adopt { avatar: Arc<Avatar>, stream: Arc<EncodedTemplate> },
@@ -90,7 +87,7 @@ pub(crate) enum Change {
 #[derive(Debug)]
 pub(crate) struct Workshop {
     gpu: GpuContext,
-    /// Avatar as the last round left it; `None` during a round.
+    /// Avatar as the last round left it; `None` during a round, and where the next one begins with the surface.
     avatar: Option<Arc<Avatar>>,
     in_use: Option<Arc<Avatar>>,
     judge: Judge,
@@ -109,7 +106,7 @@ pub(crate) struct Workshop {
     error_in_use: f64,
     /// Whether the last round was a success.
     succeeded: bool,
-    /// Whether a version was better in a camera that it was not fitted to.
+    /// Whether a version was better on key sets, and with [`LEAST_CAMERAS`] in a camera, that it was not fitted to.
     proven: bool,
     /// Skeleton of the tracked person, and whether a graph deforms it.
     skeleton: Skeleton,
@@ -123,21 +120,15 @@ pub(crate) struct Workshop {
 impl Workshop {
     /// Starts from the person as it is.
     pub fn new(beginning: Beginning) -> Result<Self, FusionError> {
-        let Beginning { gpu, rig, settings, template, base, colors, in_use, stopped } = beginning;
+        let Beginning { gpu, rig, settings, template, base, in_use, stopped } = beginning;
         let in_use_is_known = in_use.is_some();
-        let avatar = match &in_use {
-            Some(avatar) => avatar.shared_on(&base.graph),
-            None => {
-                let surface = base.surface.inset();
-                Arc::new(Avatar::new(&template, &surface, Some(&base.graph), &colors, HarmonicOrder::Zero)?)
-            }
-        };
+        let avatar = in_use.as_ref().map(|avatar| avatar.shared_on(&base.graph));
         let cameras = rig.cameras.iter().map(|camera| camera.id.clone()).collect();
         let skeleton = template.skeleton.clone();
         let judge = Judge::new(&gpu, (template, base), (&rig, &settings), stopped);
         Ok(Self {
             gpu,
-            avatar: Some(avatar),
+            avatar,
             in_use,
             judge,
             sets: BTreeMap::new(),
@@ -211,9 +202,10 @@ impl Workshop {
         }
         let Some(fit) = self.fit.take() else { return Ok(None) };
         let fitted = Arc::new(fit.into_model().into_avatar());
-        self.avatar = Some(Arc::clone(&fitted));
-        let verdict = self.compare(fitted);
+        let verdict = self.compare(&fitted);
         self.judge.rest();
+        // The next trial leaves out another camera, which this one has seen.
+        self.avatar = Some(fitted).filter(|_| self.proven);
         verdict.map(Some)
     }
 
@@ -222,18 +214,29 @@ impl Workshop {
         self.cameras.get(self.rounds as usize % self.cameras.len().max(1))
     }
 
+    /// Returns whether a camera is left out of the round's fit.
+    fn is_trial(&self) -> bool {
+        !self.proven && self.cameras.len() >= LEAST_CAMERAS
+    }
+
     /// Begins a round with the key sets that are not held back.
     fn begin(&mut self) -> Result<(), FusionError> {
-        let Some(avatar) = self.avatar.take() else { return Ok(()) };
         self.rounds += 1;
-        let is_trial = !self.proven && self.cameras.len() >= LEAST_CAMERAS;
-        let left_out = self.compared_camera().filter(|_| is_trial);
+        let left_out = self.compared_camera().filter(|_| self.is_trial()).cloned();
+        let avatar = match self.avatar.take() {
+            Some(avatar) => avatar,
+            None => {
+                let begun = self.judge.surface(&Compared::of(&self.sets), left_out.as_ref());
+                self.judge.rest();
+                Arc::new(begun?)
+            }
+        };
         let (mut frames, mut views) = (Vec::new(), Vec::<TrainingView>::new());
         for (_, set) in self.sets.values().filter(|(_, set)| !is_held_back(set.choice.slot)) {
             let frame = |pose| TrainingFrame { pose, translations: set.translations.clone() };
             let at_set = frames.len();
             frames.push(frame(set.pose.clone()));
-            for view in set.views.iter().filter(|view| left_out != Some(&view.crop.camera().id)) {
+            for view in set.views.iter().filter(|view| left_out.as_ref() != Some(&view.crop.camera().id)) {
                 let own = view.pose.as_ref().map(|pose| {
                     frames.push(frame(pose.clone()));
                     frames.len() - 1
@@ -275,20 +278,21 @@ impl Workshop {
     }
 
     /// Compares the fitted avatar with the person in use, on the newest key sets that were held back.
-    fn compare(&mut self, new: Arc<Avatar>) -> Result<Verdict, FusionError> {
+    fn compare(&mut self, new: &Arc<Avatar>) -> Result<Verdict, FusionError> {
         self.unchecked = 0;
         self.succeeded = false;
         let Some(camera) = self.compared_camera().cloned() else { return Ok(self.undecided()) };
         let sets = Compared::of(&self.sets);
         let mut error = |avatar| self.judge.error(avatar, &sets, &camera);
-        let (surface, found) = (error(None)?, error(Some(&new))?);
+        let (surface, found) = (error(None)?, error(Some(new))?);
         let old = self.in_use.as_ref().map(|avatar| error(Some(avatar))).transpose()?.flatten();
         // Its memory is free for the template of the stream.
         self.judge.rest();
         let (Some(surface), Some(found)) = (surface, found) else { return Ok(self.undecided()) };
         let in_use = old.unwrap_or(surface);
         let change = if found < BETTER * in_use.min(surface) {
-            if self.proven { self.adopt(new)? } else { Change::Prove }
+            // Key sets alone prove less than a camera that the fit has not seen.
+            if self.proven || self.is_trial() { self.adopt(Arc::clone(new))? } else { Change::Prove }
         } else if old.is_some_and(|old| surface < BETTER * old) {
             Change::Drop
         } else {

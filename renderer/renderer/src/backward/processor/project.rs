@@ -53,6 +53,7 @@ pub(super) fn add_isotropic(
 }
 
 /// Carries an anisotropic Gaussian's sums to its centre, its scales and opacity, and its rotation.
+#[inline(always)]
 pub(super) fn add_anisotropic(
     rendered: &RasterImage,
     sums: &PairSum,
@@ -91,6 +92,7 @@ pub(super) fn add_anisotropic(
 }
 
 /// Adds finite values only.
+#[inline(always)]
 fn add(out: &mut [f32; 4], more: Vec4) {
     if more.is_finite() {
         *out = (Vec4::from(*out) + more).to_array();
@@ -99,6 +101,7 @@ fn add(out: &mut [f32; 4], more: Vec4) {
 
 /// Returns dL/d pixel and dL/d covariance before the filter, whose matrix root has these rows: through the conic, and
 /// through the opacity sqrt(det / filtered_det).
+#[inline(always)]
 fn through_ellipse(rendered: &RasterImage, sums: &PairSum, [row_x, row_y]: [Vec3; 2]) -> (Vec2, Mat2) {
     let [slope, slope_x, slope_y, _, xx_moment, xy_moment, yy_moment, ..] = *sums;
     let (xx, xy, yy) = (row_x.dot(row_x), row_x.dot(row_y), row_y.dot(row_y));
@@ -126,6 +129,7 @@ struct ProjectedPoint<'a> {
 }
 
 impl<'a> ProjectedPoint<'a> {
+    #[inline(always)]
     fn new(camera: &'a CameraConstants, world: Vec3) -> Self {
         let p = camera.to_camera(world);
         let inverse_z = 1.0 / p.z;
@@ -135,6 +139,7 @@ impl<'a> ProjectedPoint<'a> {
     }
 
     /// Returns dL/d world position, given dL/d pixel, dL/d Jacobian by columns and dL/d depth.
+    #[inline(always)]
     fn to_world(&self, d_pixel: Vec2, d_jacobian: [Vec2; 3], by_depth: f32) -> Vec3 {
         let Self { camera, ideal, inverse_z, jacobian: [along_x, along_y, along_z], .. } = *self;
         let focal = Vec2::from(camera.focal_px) * inverse_z;
@@ -155,6 +160,7 @@ impl<'a> ProjectedPoint<'a> {
 }
 
 /// Returns dL/d ideal image point through the lens's Jacobian, given dL/d Jacobian by columns.
+#[inline(always)]
 fn through_lens_jacobian(camera: &CameraConstants, ideal: Vec2, d: [Vec2; 2]) -> Vec2 {
     let Vec2 { x, y } = ideal;
     let r2 = ideal.length_squared();

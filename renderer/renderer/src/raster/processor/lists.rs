@@ -144,12 +144,7 @@ impl Lists {
         self.painted.resize(count, [0.0; 4]);
         let chunks = self.painted.par_chunks_mut(CHUNK).zip(&mut self.visible);
         chunks.enumerate().for_each(|(chunk, (painted, visible))| {
-            visible.retain(|one| {
-                let i = one.gaussian as usize;
-                let color = harmonics.color(i);
-                painted[i - chunk * CHUNK] = color.unwrap_or_default();
-                color.is_some()
-            });
+            flyrig_types::vectorized(PaintChunk { harmonics, first: chunk * CHUNK, painted, visible });
         });
     }
 
@@ -266,6 +261,32 @@ impl<S: Source> pulp::NullaryFnOnce for ProjectChunk<'_, S> {
                 visible.push(Ranked { key: drawn.depth.to_bits(), gaussian: i as u32, rect });
             }
         }
+    }
+}
+
+/// Drawn Gaussians of a chunk whose colours are wanted.
+struct PaintChunk<'a> {
+    harmonics: Harmonics<'a>,
+    first: usize,
+    painted: &'a mut [[f32; 4]],
+    visible: &'a mut Vec<Ranked>,
+}
+
+impl pulp::NullaryFnOnce for PaintChunk<'_> {
+    type Output = ();
+
+    #[inline(always)]
+    fn call(self) {
+        let Self { harmonics, first, painted, visible } = self;
+        visible.retain(
+            #[inline(always)]
+            |one| {
+                let i = one.gaussian as usize;
+                let color = harmonics.color(i);
+                painted[i - first] = color.unwrap_or_default();
+                color.is_some()
+            },
+        );
     }
 }
 
