@@ -10,7 +10,7 @@ use std::{
     time::{Duration, Instant},
 };
 
-use flyrig_types::{caught, saturating_secs};
+use flyrig_types::{caught, deadline_after, saturating_secs};
 
 use super::{
     key_sets::KeySet,
@@ -104,9 +104,11 @@ fn work(
     let pool = rayon::ThreadPoolBuilder::new().num_threads(threads as usize).thread_name(|_| NAME.to_owned()).build();
     let pool = pool.map_err(|error| FusionError::ThreadFailed { name: NAME.to_owned(), panic: error.to_string() })?;
     let mut workshop = pool.install(|| Workshop::new(beginning))?;
-    let mut pause = Duration::ZERO;
+    // End of the pause after the last piece of work; a key set that comes meanwhile does not extend it.
+    let mut rested = Instant::now();
     loop {
         let is_idle = !workshop.is_busy() || is_held.load(Ordering::Relaxed);
+        let pause = rested.saturating_duration_since(Instant::now());
         match waiting.recv_timeout(if is_idle { IDLE } else { pause }) {
             Ok(set) => {
                 workshop.add(set);
@@ -122,6 +124,6 @@ fn work(
         {
             return Ok(());
         }
-        pause = saturating_secs(start.elapsed().as_secs_f64() * (1.0 / share - 1.0));
+        rested = deadline_after(saturating_secs(start.elapsed().as_secs_f64() * (1.0 / share - 1.0)));
     }
 }
