@@ -269,3 +269,24 @@ fn nothing_happens_where_no_gradient_comes_in_or_the_kind_differs() {
         assert!(nothing.iter().flatten().flatten().all(|v| *v == 0.0), "the image shows another order");
     });
 }
+
+#[test]
+fn an_image_without_depth_has_the_slopes_of_its_colors() {
+    on_both(|gpu| {
+        let mut rng = StdRng::seed_from_u64(7);
+        let scene = random_ellipsoids(&mut rng, 800, HarmonicOrder::One);
+        let camera = random_camera(&mut rng, LENSES[0], 120, 90);
+        let mut incoming = random_incoming(&mut rng, 120 * 90);
+        let mut kernels = Kernels::new(gpu).unwrap();
+        let settings = RasterSettings { outputs: flyrig_renderer::Outputs::COLOR, ..SETTINGS };
+        let found = kernels.run(&scene, &[(&camera, &incoming)], &settings).unwrap();
+        incoming.depth_carry.fill([0.0; 4]);
+        let expected = kernels.run(&scene, &[(&camera, &incoming)], &SETTINGS).unwrap();
+        for (a, b) in found.iter().zip(&expected) {
+            let size = b.iter().flatten().map(|v| v.abs()).fold(0.0, f32::max);
+            assert!(
+                size > 0.0 && a.iter().flatten().zip(b.iter().flatten()).all(|(a, b)| (a - b).abs() <= 1e-5 * size)
+            );
+        }
+    });
+}

@@ -47,6 +47,20 @@ impl<'a> Compared<'a> {
         held.drain(..held.len().saturating_sub(COMPARED));
         Self { seen, held }
     }
+
+    /// Returns whether a camera shows the person in the key sets that were held back.
+    pub fn is_compared_in(&self, camera: &CameraId) -> bool {
+        shows(&self.held, camera)
+    }
+
+    /// Returns whether a camera shows the person in the key sets that a version may be made from.
+    pub fn is_seen_in(&self, camera: &CameraId) -> bool {
+        shows(&self.seen, camera)
+    }
+}
+
+fn shows(sets: &[&KeySet], camera: &CameraId) -> bool {
+    sets.iter().any(|set| set.views.iter().any(|view| view.crop.camera().id == *camera))
 }
 
 /// Comparison of versions.
@@ -96,7 +110,7 @@ impl Judge {
         Ok(StandIn { subject, rasterizer, target: None })
     }
 
-    /// Returns the surface of the person, painted from key sets without one of the cameras.
+    /// Returns the surface of the person, painted from key sets without one of the cameras. Painting ends early when it is stopped.
     pub fn surface(
         &mut self,
         Compared { seen, .. }: &Compared<'_>,
@@ -104,6 +118,9 @@ impl Judge {
     ) -> Result<Avatar, FusionError> {
         let mut stand_in = self.stand_in()?;
         for set in seen {
+            if self.stopped.load(Ordering::Relaxed) {
+                break;
+            }
             let views = set.views.iter().filter(|view| Some(&view.crop.camera().id) != without);
             stand_in.paint(&self.gpu, set, &set.pose, views)?;
         }
@@ -121,6 +138,9 @@ impl Judge {
         Compared { seen, held }: &Compared<'_>,
         camera: &CameraId,
     ) -> Result<Option<f64>, FusionError> {
+        if self.stopped.load(Ordering::Relaxed) {
+            return Ok(None);
+        }
         let mut stand_in = match self.stand_in.take() {
             Some(known) => known,
             None => self.stand_in()?,

@@ -4,7 +4,7 @@ use std::{
     sync::{
         Arc,
         atomic::{AtomicBool, Ordering},
-        mpsc::{Receiver, RecvTimeoutError, SyncSender, TrySendError, sync_channel},
+        mpsc::{Receiver, RecvTimeoutError, Sender, SyncSender, TrySendError, channel, sync_channel},
     },
     thread::JoinHandle,
     time::{Duration, Instant},
@@ -16,7 +16,7 @@ use super::{
     key_sets::KeySet,
     workshop::{Beginning, Verdict, Workshop},
 };
-use crate::error::FusionError;
+use crate::{error::FusionError, health::release_free_memory};
 
 /// Name of the thread.
 const NAME: &str = "learner";
@@ -45,7 +45,8 @@ impl LearnerThread {
     /// Starts the thread.
     pub fn start(beginning: Beginning) -> Result<Self, FusionError> {
         let (sets, waiting) = sync_channel(WAITING);
-        let (found, verdicts) = sync_channel(WAITING);
+        // Without a limit: they are few, and a thread that waited for a session that ends would never end.
+        let (found, verdicts) = channel();
         let held = Arc::new(AtomicBool::new(false));
         let is_held = Arc::clone(&held);
         let stopped = Arc::clone(&beginning.stopped);
@@ -94,7 +95,7 @@ impl Drop for LearnerThread {
 fn work(
     beginning: Beginning,
     waiting: &Receiver<KeySet>,
-    found: &SyncSender<Result<Verdict, String>>,
+    found: &Sender<Result<Verdict, String>>,
     is_held: &AtomicBool,
 ) -> Result<(), FusionError> {
     let cores = std::thread::available_parallelism().map_or(1.0, |cores| cores.get() as f64);
@@ -119,10 +120,12 @@ fn work(
             Err(RecvTimeoutError::Timeout) => {}
         }
         let start = Instant::now();
-        if let Some(verdict) = pool.install(|| workshop.work())?
-            && found.send(Ok(verdict)).is_err()
-        {
-            return Ok(());
+        if let Some(verdict) = pool.install(|| workshop.work())? {
+            // The fit and the comparison have ended.
+            release_free_memory();
+            if found.send(Ok(verdict)).is_err() {
+                return Ok(());
+            }
         }
         rested = deadline_after(saturating_secs(start.elapsed().as_secs_f64() * (1.0 / share - 1.0)));
     }

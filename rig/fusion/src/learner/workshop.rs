@@ -23,7 +23,7 @@ use crate::{
     subject::{avatar_stream::encode_tracked_avatar, surface::GraphedSurface},
 };
 
-/// Steps of a round in which a camera is left out, and of one with all cameras.
+/// Steps of a round before any version was proven, and of a later one.
 const TRIAL_STEPS: u32 = 200;
 const ROUND_STEPS: u32 = 300;
 /// Share of a fit's course at which later rounds begin: their rates are lower.
@@ -62,7 +62,7 @@ pub(crate) struct Verdict {
     /// Change of the person.
     pub change: Change,
     pub round: u32,
-    /// Key sets that it was fitted to.
+    /// Key sets that were not held back.
     pub fitted: usize,
     /// Error on the key sets that were held back, of the person in use and of the new version.
     pub errors: [f64; 2],
@@ -102,8 +102,8 @@ pub(crate) struct Workshop {
     fresh: usize,
     /// Held-back key sets that came since the last comparison and show what is known.
     unchecked: usize,
-    /// Error of the version in use when it was adopted.
-    error_in_use: f64,
+    /// Error of the version in use when it was compared last, and the camera.
+    error_in_use: Option<(CameraId, f64)>,
     /// Whether the last round was a success.
     succeeded: bool,
     /// Whether a version was better on key sets, and with [`LEAST_CAMERAS`] in a camera, that it was not fitted to.
@@ -115,6 +115,9 @@ pub(crate) struct Workshop {
     took: Duration,
     /// Cameras of the rig.
     cameras: Vec<CameraId>,
+    /// Camera of this round's comparison, and whether it is left out of the fit.
+    compared: Option<CameraId>,
+    is_trial: bool,
 }
 
 impl Workshop {
@@ -138,13 +141,15 @@ impl Workshop {
             rounds: 0,
             fresh: 0,
             unchecked: 0,
-            error_in_use: f64::INFINITY,
+            error_in_use: None,
             succeeded: true,
             proven: in_use_is_known,
             skeleton,
             is_deformed: settings.tracking.options().is_some(),
             took: Duration::ZERO,
             cameras,
+            compared: None,
+            is_trial: false,
         })
     }
 
@@ -205,31 +210,33 @@ impl Workshop {
         let verdict = self.compare(&fitted);
         self.judge.rest();
         // The next trial leaves out another camera, which this one has seen.
-        self.avatar = Some(fitted).filter(|_| self.proven);
+        self.avatar = Some(fitted).filter(|_| self.proven || !self.is_trial);
         verdict.map(Some)
     }
 
-    /// Returns the camera of this round's comparison; without a version that was proven, it is left out of the fit.
-    fn compared_camera(&self) -> Option<&CameraId> {
-        self.cameras.get(self.rounds as usize % self.cameras.len().max(1))
+    /// Returns the next camera to compare: one after the other of those that see the person in the newest key sets that were held back.
+    fn next_camera(&self, sets: &Compared<'_>) -> Option<CameraId> {
+        let seeing: Vec<&CameraId> = self.cameras.iter().filter(|camera| sets.is_compared_in(camera)).collect();
+        seeing.get(self.rounds as usize % seeing.len().max(1)).copied().cloned()
     }
 
-    /// Returns whether a camera is left out of the round's fit.
-    fn is_trial(&self) -> bool {
-        !self.proven && self.cameras.len() >= LEAST_CAMERAS
-    }
-
-    /// Begins a round with the key sets that are not held back.
+    /// Begins a round with the key sets that are not held back. Waits for others where no image of them, or of those that were held
+    /// back, shows the person.
     fn begin(&mut self) -> Result<(), FusionError> {
+        self.fresh = 0;
+        let sets = Compared::of(&self.sets);
+        let seeing = self.cameras.iter().filter(|camera| sets.is_seen_in(camera)).count();
+        self.compared = self.next_camera(&sets).filter(|_| seeing > 0);
+        self.is_trial = !self.proven && seeing >= LEAST_CAMERAS;
+        let Some(camera) = self.compared.clone() else {
+            self.succeeded = false;
+            return Ok(());
+        };
         self.rounds += 1;
-        let left_out = self.compared_camera().filter(|_| self.is_trial()).cloned();
+        let left_out = Some(camera).filter(|_| self.is_trial);
         let avatar = match self.avatar.take() {
             Some(avatar) => avatar,
-            None => {
-                let begun = self.judge.surface(&Compared::of(&self.sets), left_out.as_ref());
-                self.judge.rest();
-                Arc::new(begun?)
-            }
+            None => Arc::new(self.judge.surface(&sets, left_out.as_ref())?),
         };
         let (mut frames, mut views) = (Vec::new(), Vec::<TrainingView>::new());
         for (_, set) in self.sets.values().filter(|(_, set)| !is_held_back(set.choice.slot)) {
@@ -251,7 +258,7 @@ impl Workshop {
         let model = AvatarModel::new(avatar, frames, AvatarFitSettings::default());
         let settings = FitSettings { seed: u64::from(self.rounds), ..FitSettings::default() };
         self.fit = Some(Fit::new(&self.gpu, model, views, settings)?);
-        (self.steps, self.fresh) = (0, 0);
+        self.steps = 0;
         Ok(())
     }
 
@@ -259,10 +266,10 @@ impl Workshop {
     /// person any more; a round begins if it fits worse than it did.
     fn check(&mut self) -> Result<Option<Verdict>, FusionError> {
         self.unchecked = 0;
-        let (Some(avatar), Some(camera)) = (self.in_use.clone(), self.compared_camera().cloned()) else {
-            return Ok(None);
-        };
         let sets = Compared::of(&self.sets);
+        let before = self.error_in_use.clone().filter(|(camera, _)| sets.is_compared_in(camera));
+        let camera = before.as_ref().map(|(camera, _)| camera.clone()).or_else(|| self.next_camera(&sets));
+        let (Some(avatar), Some(camera)) = (self.in_use.clone(), camera) else { return Ok(None) };
         let surface = self.judge.error(None, &sets, &camera)?;
         let in_use = self.judge.error(Some(&avatar), &sets, &camera)?;
         let (Some(surface), Some(in_use)) = (surface, in_use) else { return Ok(None) };
@@ -271,8 +278,9 @@ impl Workshop {
             let (round, fitted, took) = (self.rounds, sets.seen.len(), Duration::ZERO);
             return Ok(Some(Verdict { round, fitted, errors: [in_use, surface], change: Change::Drop, took }));
         }
-        if in_use > WORSE * self.error_in_use {
-            self.succeeded = true;
+        match before {
+            Some((_, before)) => self.succeeded |= in_use > WORSE * before,
+            None => self.error_in_use = Some((camera, in_use)),
         }
         Ok(None)
     }
@@ -281,7 +289,7 @@ impl Workshop {
     fn compare(&mut self, new: &Arc<Avatar>) -> Result<Verdict, FusionError> {
         self.unchecked = 0;
         self.succeeded = false;
-        let Some(camera) = self.compared_camera().cloned() else { return Ok(self.undecided()) };
+        let Some(camera) = self.compared.clone() else { return Ok(self.undecided()) };
         let sets = Compared::of(&self.sets);
         let mut error = |avatar| self.judge.error(avatar, &sets, &camera);
         let (surface, found) = (error(None)?, error(Some(new))?);
@@ -292,7 +300,7 @@ impl Workshop {
         let in_use = old.unwrap_or(surface);
         let change = if found < BETTER * in_use.min(surface) {
             // Key sets alone prove less than a camera that the fit has not seen.
-            if self.proven || self.is_trial() { self.adopt(Arc::clone(new))? } else { Change::Prove }
+            if self.proven || self.is_trial { self.adopt(Arc::clone(new))? } else { Change::Prove }
         } else if old.is_some_and(|old| surface < BETTER * old) {
             Change::Drop
         } else {
@@ -303,9 +311,11 @@ impl Workshop {
         self.succeeded = matches!(verdict.change, Change::Adopt { .. } | Change::Prove);
         self.proven |= self.succeeded;
         match &verdict.change {
-            Change::Adopt { avatar, .. } => (self.in_use, self.error_in_use) = (Some(Arc::clone(avatar)), found),
+            Change::Adopt { avatar, .. } => {
+                (self.in_use, self.error_in_use) = (Some(Arc::clone(avatar)), Some((camera, found)));
+            }
             Change::Drop => self.in_use = None,
-            Change::Keep | Change::Prove => {}
+            Change::Keep | Change::Prove => self.error_in_use = old.map(|old| (camera, old)),
         }
         Ok(verdict)
     }
