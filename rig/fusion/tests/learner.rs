@@ -210,6 +210,21 @@ fn a_thread_learns_while_frame_sets_go_on_and_ends_with_its_session() {
 }
 
 #[test]
+fn cameras_that_do_not_see_the_person_take_no_part() {
+    let avatar = truth([[0.5, 0.05, 0.03], [0.05, 0.1, 0.5]]);
+    let mut session = session(gpu(), learning(), None);
+    session.set_learning_steps(25);
+    let mut scene = AvatarScene::new(session.gpu(), &avatar).unwrap();
+    for index in 0..140 {
+        let mut images: Vec<_> = views(&mut scene, &avatar, index, &rig().cameras).iter().map(photograph).collect();
+        images[1..].iter_mut().for_each(|(_, mask)| mask.fill(0));
+        session.process(&frame_set(index as u64, &images)).unwrap();
+    }
+    let progress = session.learning().unwrap();
+    assert!(progress.version > 0 && progress.rounds > 1, "{progress:?}");
+}
+
+#[test]
 fn nothing_is_learnt_from_empty_images_and_networks_exclude_learning() {
     let mut session = session(gpu(), learning(), None);
     session.set_learning_steps(25);
