@@ -4,7 +4,7 @@ use std::{
     sync::{
         Arc,
         atomic::{AtomicBool, Ordering},
-        mpsc::{Receiver, RecvTimeoutError, Sender, SyncSender, TrySendError, channel, sync_channel},
+        mpsc::{Receiver, RecvTimeoutError, SyncSender, TrySendError, sync_channel},
     },
     thread::JoinHandle,
     time::{Duration, Instant},
@@ -33,7 +33,7 @@ const IDLE: Duration = Duration::from_millis(100);
 #[derive(Debug)]
 pub(super) struct LearnerThread {
     sets: Option<SyncSender<KeySet>>,
-    verdicts: Receiver<Result<Verdict, String>>,
+    verdicts: Option<Receiver<Result<Verdict, String>>>,
     /// Whether the thread waits, so that the rig gets everything.
     held: Arc<AtomicBool>,
     /// Whether the thread ends as soon as it can.
@@ -45,8 +45,7 @@ impl LearnerThread {
     /// Starts the thread.
     pub fn start(beginning: Beginning) -> Result<Self, FusionError> {
         let (sets, waiting) = sync_channel(WAITING);
-        // Without a limit: they are few, and a thread that waited for a session that ends would never end.
-        let (found, verdicts) = channel();
+        let (found, verdicts) = sync_channel(WAITING);
         let held = Arc::new(AtomicBool::new(false));
         let is_held = Arc::clone(&held);
         let stopped = Arc::clone(&beginning.stopped);
@@ -61,7 +60,7 @@ impl LearnerThread {
         };
         let thread = std::thread::Builder::new().name(NAME.to_owned()).spawn(work);
         let thread = thread.map_err(|source| FusionError::Thread { name: NAME, source })?;
-        Ok(Self { sets: Some(sets), verdicts, held, stopped, thread: Some(thread) })
+        Ok(Self { sets: Some(sets), verdicts: Some(verdicts), held, stopped, thread: Some(thread) })
     }
 
     /// Hands a key set over. Returns whether there was room for it.
@@ -76,14 +75,15 @@ impl LearnerThread {
 
     /// Returns the next result; a text for a thread that has failed.
     pub fn verdict(&self) -> Option<Result<Verdict, String>> {
-        self.verdicts.try_recv().ok()
+        self.verdicts.as_ref()?.try_recv().ok()
     }
 }
 
 impl Drop for LearnerThread {
     fn drop(&mut self) {
         self.stopped.store(true, Ordering::Relaxed);
-        self.sets = None;
+        // A thread that waits at a full queue ends as well.
+        (self.sets, self.verdicts) = (None, None);
         if let Some(thread) = self.thread.take() {
             // Its panics are caught inside.
             drop(thread.join());
@@ -95,7 +95,7 @@ impl Drop for LearnerThread {
 fn work(
     beginning: Beginning,
     waiting: &Receiver<KeySet>,
-    found: &Sender<Result<Verdict, String>>,
+    found: &SyncSender<Result<Verdict, String>>,
     is_held: &AtomicBool,
 ) -> Result<(), FusionError> {
     let cores = std::thread::available_parallelism().map_or(1.0, |cores| cores.get() as f64);
