@@ -2,6 +2,7 @@
 
 mod known;
 mod live;
+mod person_saver;
 
 use std::path::Path;
 

@@ -15,14 +15,13 @@ use flyrig_monitor::{Monitor, effort, ended_by_itself};
 use flyrig_report::stop;
 use signal_hook::consts::SIGUSR1;
 
+use super::person_saver::PersonSaver;
 use crate::{config::Config, recording::RigRecording};
 
 /// Longest wait of a step for a frame set before health and Ctrl-C are checked.
 const STEP: Duration = Duration::from_millis(200);
 /// Interval between lines with rates.
 const PRINT_EVERY: Duration = Duration::from_secs(5);
-/// Interval at which the learned person is saved.
-const SAVE_EVERY: Duration = Duration::from_secs(60);
 
 /// Running rig.
 pub(super) struct LiveRun<'a> {
@@ -33,7 +32,8 @@ pub(super) struct LiveRun<'a> {
     /// Set by SIGUSR1: people are measured again.
     measure: Arc<AtomicBool>,
     started: Instant,
-    saved: Instant,
+    /// Saver of the person, if the configuration names a file.
+    saver: Option<PersonSaver>,
     /// Time of the last line with rates, and the frame sets until then; `None` if a table shows them.
     printed: Option<(Instant, u64)>,
 }
@@ -57,7 +57,7 @@ impl<'a> LiveRun<'a> {
             recording,
             measure,
             started,
-            saved: started,
+            saver: config.body.person_file().map(PersonSaver::new),
             printed: prints_rates.then_some((started, 0)),
         })
     }
@@ -75,10 +75,7 @@ impl<'a> LiveRun<'a> {
             monitor.report(|| (self.rig.health(), self.recorder.map(Recorder::state)));
             let Some(step) = step else { continue };
             self.record(&step)?;
-            if self.saved.elapsed() >= SAVE_EVERY {
-                self.save_person()?;
-                self.saved = Instant::now();
-            }
+            self.save_person()?;
             self.print_rates();
         }
         Ok(())
@@ -93,7 +90,7 @@ impl<'a> LiveRun<'a> {
         }
         let stats = camera_stats(self.rig.health());
         let (frames, seen) = (self.rig.frames(), self.rig.session.has_people());
-        let saved = self.save_person();
+        let saved = self.save_last();
         self.rig.finish()?;
         saved?;
         ensure!(
@@ -132,13 +129,18 @@ impl<'a> LiveRun<'a> {
         Ok(())
     }
 
-    /// Saves the learned person if the configuration names a file.
+    /// Starts to save the person when it is time.
     fn save_person(&mut self) -> Result<()> {
-        let Some(path) = self.config.body.person_file() else { return Ok(()) };
-        if let Some(memory) = self.rig.snapshot()?.get(&PersonId::default()) {
-            memory.save(path)?;
+        let Some(saver) = &mut self.saver else { return Ok(()) };
+        if saver.is_due() {
+            saver.start(self.rig.snapshot()?.get(&PersonId::default()).cloned());
         }
         Ok(())
+    }
+
+    fn save_last(&mut self) -> Result<()> {
+        let Some(saver) = self.saver.take() else { return Ok(()) };
+        saver.finish(self.rig.snapshot()?.get(&PersonId::default()))
     }
 
     fn print_rates(&mut self) {
