@@ -1,0 +1,122 @@
+//! Self-intersections of triangle meshes.
+
+use glam::{DVec3, I64Vec3};
+use rayon::prelude::*;
+
+use crate::mesh::TriMesh;
+
+/// Cells that a triangle covers on average, at most.
+const CELLS_A_TRIANGLE: f64 = 16.0;
+
+/// Box around a triangle, in cells.
+type Range = (I64Vec3, I64Vec3);
+
+/// Counts the pairs of triangles that intersect and share no vertex. Pairs in one plane are not counted, triangles with
+/// coordinates that are not finite are ignored.
+#[must_use]
+pub fn self_intersections(mesh: &TriMesh) -> usize {
+    let boxes: Vec<Option<(DVec3, DVec3)>> = (0..mesh.triangles.len())
+        .map(|i| {
+            let [a, b, c] = mesh.corners(i);
+            let finite = a.is_finite() && b.is_finite() && c.is_finite();
+            finite.then(|| (a.min(b).min(c), a.max(b).max(c)))
+        })
+        .collect();
+    let sizes = boxes.iter().flatten().map(|(low, high)| (*high - *low).max_element());
+    let mean = sizes.sum::<f64>() / boxes.len().max(1) as f64;
+    if mean <= 0.0 {
+        return 0;
+    }
+    let origin = boxes.iter().flatten().map(|(low, _)| *low).reduce(DVec3::min).unwrap_or(DVec3::ZERO);
+    let mut cell = mean * 1.5;
+    let range = |cell: f64, (low, high): (DVec3, DVec3)| -> Range {
+        (((low - origin) / cell).floor().as_i64vec3(), ((high - origin) / cell).floor().as_i64vec3())
+    };
+    let covered = |cell: f64| -> f64 {
+        let cells = |bounds: &(DVec3, DVec3)| {
+            let (low, high) = range(cell, *bounds);
+            (high.as_dvec3() - low.as_dvec3() + 1.0).element_product()
+        };
+        boxes.iter().flatten().map(cells).sum()
+    };
+    while covered(cell) > CELLS_A_TRIANGLE * boxes.len() as f64 {
+        cell *= 1.5;
+    }
+    let ranges: Vec<Option<Range>> = boxes.iter().map(|bounds| bounds.map(|bounds| range(cell, bounds))).collect();
+    let mut rows: Vec<([i64; 3], u32)> = Vec::new();
+    for (i, (low, high)) in ranges.iter().enumerate().filter_map(|(i, range)| Some((i, (*range)?))) {
+        for z in low.z..=high.z {
+            for y in low.y..=high.y {
+                rows.extend((low.x..=high.x).map(|x| ([z, y, x], i as u32)));
+            }
+        }
+    }
+    rows.par_sort_unstable();
+    let cells: Vec<&[([i64; 3], u32)]> = rows.chunk_by(|a, b| a.0 == b.0).collect();
+    let in_cell = |rows: &&[([i64; 3], u32)]| {
+        let pairs = rows.iter().enumerate().flat_map(|(at, row)| rows[at + 1..].iter().map(move |other| (row, other)));
+        let hit = |((place, i), (_, j)): &(&([i64; 3], u32), &([i64; 3], u32))| {
+            let (i, j) = (*i as usize, *j as usize);
+            // A pair counts in the first cell that both touch.
+            let first = ranges[i].zip(ranges[j]).map(|((a, _), (b, _))| a.max(b));
+            let overlap = boxes[i].zip(boxes[j]).is_some_and(|((a, b), (c, d))| a.cmple(d).all() && c.cmple(b).all());
+            overlap && first.is_some_and(|first| [first.z, first.y, first.x] == *place) && intersect(mesh, i, j)
+        };
+        pairs.filter(hit).count()
+    };
+    cells.par_iter().map(in_cell).sum()
+}
+
+fn intersect(mesh: &TriMesh, i: usize, j: usize) -> bool {
+    if mesh.triangles[i].iter().any(|vertex| mesh.triangles[j].contains(vertex)) {
+        return false;
+    }
+    let (a, b) = (mesh.corners(i), mesh.corners(j));
+    let crosses = |sides: [DVec3; 3], triangle: [DVec3; 3]| {
+        (0..3).any(|side| segment_crosses(sides[side], sides[(side + 1) % 3], triangle))
+    };
+    crosses(a, b) || crosses(b, a)
+}
+
+/// Returns whether a segment passes through a triangle (Möller and Trumbore); `false` if parallel to it.
+fn segment_crosses(start: DVec3, end: DVec3, [a, b, c]: [DVec3; 3]) -> bool {
+    let (direction, u, v) = (end - start, b - a, c - a);
+    let normal = direction.cross(v);
+    let determinant = u.dot(normal);
+    if determinant.abs() <= 1e-12 * direction.length() * u.length() * v.length() {
+        return false;
+    }
+    let offset = start - a;
+    let p = offset.dot(normal) / determinant;
+    let turned = offset.cross(u);
+    let q = direction.dot(turned) / determinant;
+    let along = v.dot(turned) / determinant;
+    p >= 0.0 && q >= 0.0 && p + q <= 1.0 && (0.0..=1.0).contains(&along)
+}
+
+#[cfg(test)]
+mod tests {
+    use glam::Vec3;
+    use rand::{RngExt as _, SeedableRng as _, rngs::StdRng};
+
+    use super::*;
+
+    #[test]
+    fn the_grid_finds_the_pairs_of_a_plain_search() {
+        let mut random = StdRng::seed_from_u64(9);
+        let mut place = |size: f32| (Vec3::from_array(random.random::<[f32; 3]>()) - 0.5) * size;
+        let mut mesh = TriMesh::default();
+        for i in 0..300u32 {
+            let (center, size) = (place(1.0), if i % 50 == 0 { 2.0 } else { 0.2 });
+            mesh.positions.extend([center + place(size), center + place(size), center + place(size)]);
+            mesh.triangles.push([3 * i, 3 * i + 1, 3 * i + 2]);
+        }
+        let plain =
+            (0..300).flat_map(|i| (0..i).map(move |j| (i, j))).filter(|(i, j)| intersect(&mesh, *i, *j)).count();
+        assert!(plain > 20);
+        assert_eq!(self_intersections(&mesh), plain);
+        mesh.positions[0] = Vec3::splat(1e30);
+        mesh.positions[5] = Vec3::NAN;
+        self_intersections(&mesh);
+    }
+}

@@ -1,0 +1,63 @@
+//! Closed triangle meshes from oriented surface points.
+//!
+//! Centres of drawn Gaussian surfaces, or pixels of depth maps, become a closed, 2-manifold mesh in metres, in the frame of the
+//! points. [`mesh_from_points`] runs all stages; each can be called by itself:
+//!
+//! 1. [`fuse`]: signed distances in sparse blocks of voxels, weighted by distance and agreement of normals (HGM, Eq. 18).
+//! 2. [`close`]: signs of voxels without evidence from the [`Winding`] number of the points, so that holes close smoothly
+//!    and interiors stay solid.
+//! 3. [`carve`]: cut of space that is known to be empty.
+//! 4. [`marching_cubes`]: the surface, manifold by construction.
+//! 5. [`keep_largest`]: removal of floaters and cavities.
+//!
+//! [`Topology`] verifies the result. [`Normalization`] brings Gaussians to unit size (HGM, Eq. 1) and back.
+//!
+//! ```
+//! use flyrig_mesh::{MeshOptions, OrientedPoint, OrientedPoints, mesh_from_points};
+//! use glam::Vec3;
+//!
+//! let rows = (0..4000).map(|i| {
+//!     let z = 1.0 - (2.0 * i as f32 + 1.0) / 4000.0;
+//!     let (sin, cos) = (i as f32 * 2.399_963).sin_cos();
+//!     let normal = Vec3::new((1.0 - z * z).sqrt() * cos, (1.0 - z * z).sqrt() * sin, z);
+//!     OrientedPoint { position: normal * 0.2, normal, weight: 1.0, uncertainty_m: 0.001 }
+//! });
+//! let (mesh, report) = mesh_from_points(OrientedPoints::from_rows(rows), &MeshOptions::default())?;
+//! assert!(report.topology.is_closed_manifold());
+//! assert!(mesh.positions.iter().all(|position| (position.length() - 0.2).abs() < 0.002));
+//! # Ok::<(), flyrig_mesh::MeshError>(())
+//! ```
+
+mod carve;
+mod components;
+mod density;
+mod error;
+mod extract;
+mod field;
+mod intersections;
+mod marching_cubes;
+mod mesh;
+mod normalization;
+mod point_grid;
+mod points;
+mod settings;
+mod signs;
+mod topology;
+mod union_find;
+mod winding;
+
+pub use carve::{Empty, carve};
+pub use components::{Removed, keep_largest};
+pub use density::Density;
+pub use error::MeshError;
+pub use extract::{MeshOptions, MeshReport, MeshSeconds, mesh_from_points};
+pub use field::{Evidence, Field, Voxel, fuse};
+pub use intersections::self_intersections;
+pub use marching_cubes::marching_cubes;
+pub use mesh::TriMesh;
+pub use normalization::{Normalization, clamped_scales};
+pub use points::{Dropped, OrientedPoint, OrientedPoints};
+pub use settings::{Fusion, FusionSettings};
+pub use signs::close;
+pub use topology::Topology;
+pub use winding::Winding;
