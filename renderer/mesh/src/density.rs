@@ -10,7 +10,7 @@ use crate::point_grid::PointGrid;
 use crate::points::OrientedPoints;
 
 /// Points whose neighbours are searched among all others for a first estimate of the spacing.
-const SAMPLES: usize = 256;
+const SAMPLES: usize = 64;
 /// Neighbour whose distance measures the density.
 const NEIGHBOR: usize = 12;
 /// Neighbours with an agreeing normal that an area is based on; with fewer the radius is doubled.
@@ -80,8 +80,8 @@ fn area(points: &OrientedPoints, grid: &PointGrid, at: usize, first_radius: f32)
     let mut radius = first_radius;
     for round in 0..3 {
         let mut count = 0;
-        grid.in_box(own - radius, own + radius, |other| {
-            let near = own.distance_squared(points.positions()[other]) <= radius * radius;
+        grid.in_box(own - radius, own + radius, |other, position| {
+            let near = own.distance_squared(position) <= radius * radius;
             count += usize::from(near && normal.dot(points.normals()[other]) > SAME_PATCH);
         });
         if count > ENOUGH || round == 2 {

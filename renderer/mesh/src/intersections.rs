@@ -10,6 +10,8 @@ const CELLS_A_TRIANGLE: f64 = 16.0;
 
 /// Box around a triangle, in cells.
 type Range = (I64Vec3, I64Vec3);
+/// Cell in the order z, y, x, and a triangle that touches it.
+type Row = ([i64; 3], u32);
 
 /// Counts the pairs of triangles that intersect and share no vertex. Pairs in one plane are not counted, triangles with
 /// coordinates that are not finite are ignored.
@@ -43,7 +45,7 @@ pub fn self_intersections(mesh: &TriMesh) -> usize {
         cell *= 1.5;
     }
     let ranges: Vec<Option<Range>> = boxes.iter().map(|bounds| bounds.map(|bounds| range(cell, bounds))).collect();
-    let mut rows: Vec<([i64; 3], u32)> = Vec::new();
+    let mut rows: Vec<Row> = Vec::new();
     for (i, (low, high)) in ranges.iter().enumerate().filter_map(|(i, range)| Some((i, (*range)?))) {
         for z in low.z..=high.z {
             for y in low.y..=high.y {
@@ -52,10 +54,10 @@ pub fn self_intersections(mesh: &TriMesh) -> usize {
         }
     }
     rows.par_sort_unstable();
-    let cells: Vec<&[([i64; 3], u32)]> = rows.chunk_by(|a, b| a.0 == b.0).collect();
-    let in_cell = |rows: &&[([i64; 3], u32)]| {
+    let cells: Vec<&[Row]> = rows.chunk_by(|a, b| a.0 == b.0).collect();
+    let in_cell = |rows: &&[Row]| {
         let pairs = rows.iter().enumerate().flat_map(|(at, row)| rows[at + 1..].iter().map(move |other| (row, other)));
-        let hit = |((place, i), (_, j)): &(&([i64; 3], u32), &([i64; 3], u32))| {
+        let hit = |((place, i), (_, j)): &(&Row, &Row)| {
             let (i, j) = (*i as usize, *j as usize);
             // A pair counts in the first cell that both touch.
             let first = ranges[i].zip(ranges[j]).map(|((a, _), (b, _))| a.max(b));
@@ -117,6 +119,6 @@ mod tests {
         assert_eq!(self_intersections(&mesh), plain);
         mesh.positions[0] = Vec3::splat(1e30);
         mesh.positions[5] = Vec3::NAN;
-        self_intersections(&mesh);
+        assert!(self_intersections(&mesh) <= plain);
     }
 }

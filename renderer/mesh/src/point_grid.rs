@@ -44,8 +44,8 @@ pub struct PointGrid {
     cell: f32,
     /// First and last row in `order`, exclusive, per occupied cell.
     cells: HashMap<Cell, (u32, u32), BuildHasherDefault<CellHasher>>,
-    /// Indices of the points by cell and then by index.
-    order: Vec<u32>,
+    /// Indices and positions of the points by cell and then by index.
+    order: Vec<(u32, Vec3)>,
 }
 
 impl PointGrid {
@@ -62,7 +62,7 @@ impl PointGrid {
             grid.cells.insert(*cell, (start as u32, end as u32));
             start = end;
         }
-        grid.order = rows.into_iter().map(|(_, index)| index).collect();
+        grid.order = rows.into_iter().map(|(_, index)| (index, positions[index as usize])).collect();
         grid
     }
 
@@ -72,14 +72,15 @@ impl PointGrid {
         [cell.z, cell.y, cell.x]
     }
 
-    /// Calls `visit` with the index of each point in cells that touch the box, in a fixed order.
-    pub fn in_box(&self, low: Vec3, high: Vec3, mut visit: impl FnMut(usize)) {
+    /// Calls `visit` with index and position of each point in cells that touch the box, in a fixed order.
+    pub fn in_box(&self, low: Vec3, high: Vec3, mut visit: impl FnMut(usize, Vec3)) {
         let (low, high) = (self.cell_of(low), self.cell_of(high));
         for z in low[0]..=high[0] {
             for y in low[1]..=high[1] {
                 for x in low[2]..=high[2] {
                     if let Some(&(start, end)) = self.cells.get(&[z, y, x]) {
-                        self.order[start as usize..end as usize].iter().for_each(|index| visit(*index as usize));
+                        let rows = &self.order[start as usize..end as usize];
+                        rows.iter().for_each(|(index, position)| visit(*index as usize, *position));
                     }
                 }
             }
@@ -104,14 +105,17 @@ mod tests {
             let (low, high) = (Vec3::new(-0.2, -0.3, 0.0), Vec3::new(0.1, 0.3, 0.2));
             let inside = |index: &usize| points[*index].cmpge(low).all() && points[*index].cmple(high).all();
             let mut found = Vec::new();
-            grid.in_box(low, high, |index| found.push(index));
+            grid.in_box(low, high, |index, position| {
+                assert_eq!(position, points[index]);
+                found.push(index);
+            });
             found.retain(inside);
             found.sort_unstable();
             assert_eq!(found, (0..500).filter(inside).collect::<Vec<_>>());
         }
         let mut seen = 0;
-        PointGrid::new(&points, 0.1).in_box(Vec3::splat(1e30), Vec3::splat(1e30), |_| seen += 1);
+        PointGrid::new(&points, 0.1).in_box(Vec3::splat(1e30), Vec3::splat(1e30), |_, _| seen += 1);
         assert!(seen >= 1);
-        PointGrid::new(&[], 0.1).in_box(Vec3::ZERO, Vec3::ONE, |_| panic!("no points"));
+        PointGrid::new(&[], 0.1).in_box(Vec3::ZERO, Vec3::ONE, |_, _| panic!("no points"));
     }
 }

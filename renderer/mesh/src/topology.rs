@@ -124,8 +124,7 @@ fn is_degenerate(mesh: &TriMesh, triangle: usize) -> bool {
     let [a, b, c] = mesh.corners(triangle);
     let longest = a.distance_squared(b).max(b.distance_squared(c)).max(c.distance_squared(a));
     let area = area_vector([a, b, c]).length();
-    // Also true for coordinates that are not numbers.
-    !(2.0 * area > FLAT * longest)
+    area.is_nan() || longest.is_nan() || 2.0 * area <= FLAT * longest
 }
 
 #[cfg(test)]

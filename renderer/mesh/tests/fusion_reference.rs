@@ -48,9 +48,10 @@ fn reference(points: &OrientedPoints, settings: &FusionSettings, fusion: Fusion,
     if fusion == Fusion::Naive {
         return (Some(near.iter().map(|i| clamped(*i)).sum::<f64>() / near.len() as f64), margin);
     }
-    near.sort_by(|a, b| place(*a).distance(x).total_cmp(&place(*b).distance(x)));
+    let score = |i: usize| (2.0 * place(i).distance_squared(x) - (x - place(i)).dot(normal(i)).powi(2)).sqrt();
+    near.sort_by(|a, b| score(*a).total_cmp(&score(*b)));
     if near.len() > 1 {
-        margin = margin.min((place(near[1]).distance(x) - place(near[0]).distance(x)) * 1e4);
+        margin = margin.min((score(near[1]) - score(near[0])) * 1e4);
     }
     let decay = |i: usize, sigma: f64| (-place(i).distance_squared(x) / (2.0 * sigma * sigma)).exp();
     let weight = |i: usize| f64::from(points.weights()[i]);

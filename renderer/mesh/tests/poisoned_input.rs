@@ -97,7 +97,7 @@ fn huge_coordinates_are_errors() {
 
 #[test]
 fn random_soup_ends_in_a_closed_mesh_or_an_error() {
-    for seed in 0..20 {
+    for seed in 0..6 {
         let mut random = StdRng::seed_from_u64(seed);
         let rows = (0..3000).map(|_| {
             let mut vector = || Vec3::from_array(random.random::<[f32; 3]>()) - 0.5;

@@ -47,10 +47,10 @@ fn a_torus_has_one_handle() {
 
 #[test]
 fn noise_averages_out() {
-    let mut rows = sphere(200_000, Vec3::ZERO, 0.3);
+    let mut rows = sphere(90_000, Vec3::ZERO, 0.2);
     add_noise(&mut rows, 0.003, 6);
     let (mesh, report) = mesh(rows, &voxel(0.006));
-    let error = mean_abs(mesh.positions.iter().map(|place| place.length() - 0.3));
+    let error = mean_abs(mesh.positions.iter().map(|place| place.length() - 0.2));
     assert!(error < 0.0007, "{error} {:?}", report.settings);
     assert_eq!(report.topology.genus(), Some(0));
 }
@@ -113,12 +113,13 @@ fn two_boxes_12_mm_apart_are_two_bodies() {
     assert_eq!(error, MeshError::SeveralBodies { count: 2 });
     let (mesh, report) = mesh_from_points(points, &MeshOptions { bodies: 2, ..voxel(0.006) }).unwrap();
     assert_eq!((report.topology.components, report.topology.genus()), (2, Some(0)));
-    assert!(mesh.positions.iter().all(|place| !(0.002..0.01).contains(&place.z)));
+    let between: Vec<_> = mesh.positions.iter().filter(|place| (0.002..0.01).contains(&place.z)).collect();
+    assert!(between.is_empty(), "{between:?}");
 }
 
 #[test]
 fn holes_are_closed_and_reported() {
-    let all = sphere(60_000, Vec3::ZERO, 0.3);
+    let all = sphere(40_000, Vec3::ZERO, 0.3);
     for hole_m in [0.03, 0.08] {
         let rows = all.iter().filter(|row| row.position.distance(Vec3::Y * -0.3) > hole_m).copied().collect();
         let (mesh, report) = mesh(rows, &voxel(0.008));
@@ -157,10 +158,10 @@ fn open_soles_are_closed_by_a_nearly_flat_surface() {
 
 #[test]
 fn thin_shells_of_points_are_filled() {
-    let (mesh, report) = mesh(sphere(60_000, Vec3::ZERO, 0.3), &voxel(0.005));
-    assert!(mesh.positions.iter().all(|place| place.length() > 0.295));
+    let (mesh, report) = mesh(sphere(30_000, Vec3::ZERO, 0.2), &voxel(0.005));
+    assert!(mesh.positions.iter().all(|place| place.length() > 0.197));
     assert!(report.removed.volumes_m3.is_empty());
-    assert!(report.skipped_blocks > 100 && report.signed_voxels > 0);
+    assert!(report.skipped_blocks > 10 && report.signed_voxels > 0);
 }
 
 #[test]

@@ -88,7 +88,7 @@ impl Field {
         let extent = high - low;
         let size = (extent / (f64::from(voxel_m) * f64::from(SIDE))).ceil().max(DVec3::ONE);
         let blocks = size.element_product();
-        if !(blocks <= MAX_GRID_BLOCKS as f64) {
+        if blocks.is_nan() || blocks > MAX_GRID_BLOCKS as f64 {
             let extent_m = extent.as_vec3().to_array();
             return Err(MeshError::Extent { voxel_m, extent_m, blocks, limit: MAX_GRID_BLOCKS });
         }

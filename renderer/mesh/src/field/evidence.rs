@@ -61,8 +61,8 @@ impl Nearby {
     /// Computes HGM Eq. 18. All decays are relative to the nearest point's, which cancels in the mean and cannot vanish.
     fn hgm(&mut self, center: Vec3, settings: &FusionSettings) -> Option<f32> {
         let limit = settings.truncation_m * settings.truncation_m;
-        let (nearest, least) =
-            self.squared.iter().copied().enumerate().min_by(|a, b| a.1.total_cmp(&b.1)).filter(|(_, s)| *s <= limit)?;
+        let least = self.squared.iter().copied().reduce(f32::min).filter(|least| *least <= limit)?;
+        let nearest = self.nearest(center, limit)?;
         let rate = 0.5 / (settings.decay_m * settings.decay_m);
         self.decay.clear();
         self.decay.extend(self.squared.iter().map(|squared| match *squared <= limit {
@@ -87,6 +87,17 @@ impl Nearby {
         known.then(|| (sum / total) as f32)
     }
 
+    /// Returns the nearest point within the limit. Distance along the surface counts twice: beside a sharp edge, the side that
+    /// faces the voxel wins over the one whose plane passes through it.
+    fn nearest(&self, center: Vec3, limit: f32) -> Option<usize> {
+        let score = |i: usize| {
+            let along = (center - self.positions[i]).dot(self.normals[i]);
+            2.0 * self.squared[i] - along * along
+        };
+        let near = (0..self.squared.len()).filter(|i| self.squared[*i] <= limit);
+        near.map(|i| (score(i), i)).min_by(|a, b| a.0.total_cmp(&b.0)).map(|(_, i)| i)
+    }
+
     /// Returns the unit mean of the normals within the angle of `around`, or `around` if they cancel out.
     fn mean_normal(&self, around: Vec3, cosine: f32, emphasis: impl Fn(f32) -> f32) -> Vec3 {
         let accepted = self.normals.iter().enumerate().filter(|(_, normal)| normal.dot(around) > cosine);
@@ -94,7 +105,7 @@ impl Nearby {
         let sum = accepted.fold(glam::DVec3::ZERO, |sum, (i, normal)| {
             sum + normal.as_dvec3() * (f64::from(self.weights[i]) * f64::from(emphasis(self.decay[i])))
         });
-        sum.try_normalize().map_or(around, |normal| normal.as_vec3())
+        sum.try_normalize().map_or(around, glam::DVec3::as_vec3)
     }
 
     fn naive(&self, center: Vec3, settings: &FusionSettings) -> Option<f32> {

@@ -19,7 +19,7 @@ const BRICK: i32 = 2;
 /// within it. [`Fusion::Hgm`] weights a point by its own weight and by `exp(-|x - p|² / 2 sigma²)`, and accepts it if its
 /// normal lies within `theta_t` of the voxel's. The paper leaves the voxel's normal open; here it starts as the mean of
 /// the normals around the nearest point, which this point dominates, and is then recomputed from the accepted points. A
-/// voxel between two surfaces therefore follows one of them. Voxels without accepted points, or with none whose tangent
+/// voxel between two surfaces therefore follows one of them. For this choice, distance along the surface counts twice. Voxels without accepted points, or with none whose tangent
 /// plane carries it within twice sigma, stay unknown. The result is the same for any number of threads.
 ///
 /// # Errors
@@ -57,8 +57,7 @@ fn fill(
     let corner = |lattice: IVec3| field.position(lattice);
     let (low, high) = (corner(block * SIDE), corner(block * SIDE + (SIDE - 1)));
     let (mut around, mut nearby) = (Nearby::default(), Nearby::default());
-    grid.in_box(low - radius, high + radius, |index| {
-        let position = points.positions()[index];
+    grid.in_box(low - radius, high + radius, |index, position| {
         if position.distance_squared(position.clamp(low, high)) <= radius * radius {
             around.push(points, index);
         }
