@@ -10,7 +10,7 @@
 //! 4. [`marching_cubes`]: the surface, manifold by construction.
 //! 5. [`keep_largest`]: removal of floaters and cavities.
 //!
-//! [`Topology`] verifies the result. [`Normalization`] brings Gaussians to unit size (HGM, Eq. 1) and back.
+//! [`Topology`] verifies the result. [`skin_weights`] ties a mesh to a skeleton. [`Normalization`] brings Gaussians to unit size (HGM, Eq. 1) and back.
 //!
 //! ```
 //! use flyrig_mesh::{MeshOptions, OrientedPoint, OrientedPoints, mesh_from_points};
@@ -42,6 +42,7 @@ mod point_grid;
 mod points;
 mod settings;
 mod signs;
+mod skin;
 mod topology;
 mod union_find;
 mod winding;
@@ -59,5 +60,6 @@ pub use normalization::{Normalization, clamped_scales};
 pub use points::{Dropped, OrientedPoint, OrientedPoints};
 pub use settings::{Fusion, FusionSettings};
 pub use signs::close;
+pub use skin::{SkinReport, SkinSettings, skin_weights};
 pub use topology::Topology;
 pub use winding::Winding;

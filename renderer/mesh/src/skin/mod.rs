@@ -1,0 +1,91 @@
+//! Skin weights of a mesh, taken from a skinned template.
+//!
+//! A vertex takes the weights of the template's closest point where that lies near and faces the same way. The others (hair, hems,
+//! brims) follow from their neighbours: the smoothest weights on the mesh with the known ones given, which minimise the energy of the
+//! bi-Laplacian, as in robust weight transfer (Abdrashitov et al. 2023, "Robust Skin Weights Transfer via Weight Inpainting", Eq. 2).
+
+mod closest;
+mod inpaint;
+mod laplacian;
+
+use flyrig_body::{SkinWeights, Template};
+use glam::Vec3;
+use rayon::prelude::*;
+
+use crate::skin::{closest::ClosestPoints, inpaint::inpaint};
+
+/// Settings of [`skin_weights`].
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct SkinSettings {
+    /// Largest distance from the template at which a vertex takes its weights, metres.
+    pub distance_m: f32,
+    /// Largest angle between the normals, radians.
+    pub angle_rad: f32,
+}
+
+impl Default for SkinSettings {
+    fn default() -> Self {
+        Self { distance_m: 0.04, angle_rad: std::f32::consts::FRAC_PI_3 }
+    }
+}
+
+/// Counts of [`skin_weights`].
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
+pub struct SkinReport {
+    /// Vertices with weights of the template.
+    pub taken: usize,
+    /// Vertices whose weights follow from their neighbours.
+    pub inpainted: usize,
+    /// Vertices on parts of the mesh without a taken one; they have the weights of the closest point at any angle.
+    pub isolated: usize,
+}
+
+/// Returns skin weights of each vertex, at most four joints with the sum 1. `positions` and `triangles` are in the template's canonical
+/// space, metres; `normals` are unit length. Triangles with corners out of range are ignored; a vertex that is not a finite number, and
+/// every vertex where the template has no triangle, moves with the root. The same input gives the same weights for any number of
+/// threads.
+#[must_use]
+pub fn skin_weights(
+    (positions, normals): (&[Vec3], &[Vec3]),
+    triangles: &[[u32; 3]],
+    template: &Template,
+    settings: SkinSettings,
+) -> (Vec<SkinWeights>, SkinReport) {
+    let closest = ClosestPoints::new(template);
+    let cosine = settings.angle_rad.cos();
+    let near = |(i, position): (usize, &Vec3)| {
+        let normal = normals.get(i).copied().unwrap_or_default();
+        let found =
+            closest.within(*position, settings.distance_m, |triangle| closest.normal(triangle).dot(normal) >= cosine);
+        found.and_then(|found| found.weights(template))
+    };
+    let known: Vec<Option<SkinWeights>> = positions.par_iter().enumerate().with_min_len(256).map(near).collect();
+    let filled = inpaint(positions, triangles, &known);
+    let mut report = SkinReport::default();
+    let mut weights = Vec::with_capacity(positions.len());
+    for ((known, filled), position) in known.iter().zip(filled).zip(positions) {
+        weights.push(match (known, filled) {
+            (Some(known), _) => {
+                report.taken += 1;
+                *known
+            }
+            (None, Some(filled)) => {
+                report.inpainted += 1;
+                filled
+            }
+            (None, None) => {
+                report.isolated += 1;
+                closest.nearest(*position).and_then(|found| found.weights(template)).unwrap_or_else(root)
+            }
+        });
+    }
+    (weights, report)
+}
+
+/// Weights of a point that moves with the root.
+fn root() -> SkinWeights {
+    SkinWeights { joints: [0; 4], weights: [1.0, 0.0, 0.0, 0.0] }
+}
+
+#[cfg(test)]
+mod tests;
