@@ -18,7 +18,7 @@ use anyhow::Result;
 use clap::Subcommand;
 use flyrig_gpu::GpuContext;
 
-use self::inputs::load;
+pub(crate) use self::inputs::{load, open_replay};
 
 /// Subcommands of `flyrig avatar`.
 #[derive(Debug, Subcommand)]

@@ -15,7 +15,7 @@ use flyrig_training::TrainArgs;
 
 use crate::{
     arguments::TrustArgs, avatar::AvatarAction, calibrate::CalibrateAction, demo::DemoArgs, eval::EvalArgs,
-    import::ImportArgs, keys::KeysAction, plate::PlateArgs, recording::RecordArgs, replay::ReplayArgs,
+    import::ImportArgs, keys::KeysAction, mesh::MeshArgs, plate::PlateArgs, recording::RecordArgs, replay::ReplayArgs,
     serve::ServeArgs, sim_export::SimAction, stream_recording::PlayArgs, sync_check::SyncCheckArgs, view::ViewArgs,
     watch::WatchArgs,
 };
@@ -135,6 +135,8 @@ pub enum Command {
         #[command(subcommand)]
         action: AvatarAction,
     },
+    /// Write the person of a take, or an avatar, as a closed mesh with bones (glTF, PLY).
+    Mesh(MeshArgs),
     /// Print the default configuration of the simulated rig, or export a simulated capture.
     Sim {
         #[command(subcommand)]
@@ -168,6 +170,7 @@ impl Command {
             Self::Plate(args) => take("plate", from_ref(&args.input)),
             Self::Calibrate { action } => action.input().and_then(|(name, paths)| take(name, paths)),
             Self::Eval(args) => take("eval", from_ref(&args.take.dataset)),
+            Self::Mesh(args) => take("mesh", from_ref(&args.take.dataset)),
             Self::Avatar { action } => action.input().and_then(|(name, path)| take(name, from_ref(path))),
             Self::Sim { action: SimAction::Export(args) } => {
                 Some(format!("sim export: simulating {} frames for {}", args.frames, args.out.display()))

@@ -14,6 +14,7 @@ mod doctor;
 mod eval;
 mod import;
 mod keys;
+mod mesh;
 mod opening;
 mod orbit_film;
 mod plate;
@@ -144,6 +145,7 @@ fn dispatch(cli: &Cli) -> Result<()> {
             None => stream_recording::play(args),
         },
         Command::Avatar { action } => avatar::avatar(action, &|| open_gpu(cli.program.adapter.as_deref())),
+        Command::Mesh(args) => mesh::mesh(args, &|| open_gpu(cli.program.adapter.as_deref())),
         Command::Eval(args) => eval::eval(args, &open_gpu(cli.program.adapter.as_deref())?),
         Command::Sim { action: SimAction::Export(args) } => {
             let config = args.config.as_deref().map(sim_export::load_config).transpose()?.unwrap_or_default();

@@ -14,6 +14,8 @@ pub struct GlbContents<'a> {
     pub track: Option<&'a PoseTrack>,
     /// Texture as a PNG file; the material is unlit.
     pub texture: Option<&'a [u8]>,
+    /// Linear RGB of each vertex, for a lit material.
+    pub colors: Option<&'a [[f32; 3]]>,
 }
 
 /// Writes a skinned mesh atomically, in the form that [`crate::load_gltf`] reads.
@@ -61,6 +63,9 @@ pub fn write_glb(path: &Path, template: &Template, contents: GlbContents<'_>) ->
         "attributes": { "POSITION": positions, "NORMAL": normals, "TEXCOORD_0": uvs, "JOINTS_0": joints, "WEIGHTS_0": weights },
         "indices": indices,
     });
+    if let Some(colors) = contents.colors.filter(|colors| colors.len() == template.positions.len()) {
+        primitive["attributes"]["COLOR_0"] = json!(glb.floats(colors.as_flattened(), "VEC3", 3));
+    }
     let mut document = json!({
         "scene": 0,
         "scenes": [{ "nodes": [0, bones.len()] }],
@@ -136,7 +141,7 @@ mod tests {
             pose
         };
         let track = PoseTrack::new(vec![(0, pose(0.0)), (500_000_000, pose(0.7))]).unwrap();
-        write_glb(&path, &template, GlbContents { track: Some(&track), texture: None }).unwrap();
+        write_glb(&path, &template, GlbContents { track: Some(&track), ..GlbContents::default() }).unwrap();
         let human = load_gltf(&path).unwrap();
         assert_eq!(human.template.triangles, template.triangles);
         for (a, b) in human.template.positions.iter().zip(&template.positions) {
@@ -154,7 +159,7 @@ mod tests {
         }
         // A motion that repeats for minutes.
         let long = track.repeated_until(300_000_000_000);
-        write_glb(&path, &template, GlbContents { track: Some(&long), texture: None }).unwrap();
+        write_glb(&path, &template, GlbContents { track: Some(&long), ..GlbContents::default() }).unwrap();
         let read = load_gltf(&path).unwrap().track.unwrap();
         assert_eq!((read.keys().len(), read.span_nanos()), (long.keys().len(), long.span_nanos()));
         let (a, _) = skin_mesh(&human.template, &read.at(299_500_000_000));
@@ -163,8 +168,9 @@ mod tests {
         // A pose of another body.
         let single = Pose { root_translation: DVec3::ZERO, joint_rotations: vec![DQuat::IDENTITY] };
         let other = PoseTrack::new(vec![(0, single)]).unwrap();
-        let refused =
-            write_glb(&path, &template, GlbContents { track: Some(&other), texture: None }).unwrap_err().to_string();
+        let refused = write_glb(&path, &template, GlbContents { track: Some(&other), ..GlbContents::default() })
+            .unwrap_err()
+            .to_string();
         assert!(refused.contains("a pose of 1 joints does not fit"), "{refused}");
     }
 }

@@ -24,6 +24,7 @@ pub use local::atlas_map::AtlasLayout;
 pub use local::networks::LocalSettings;
 pub use model::avatar::{Attachment, Avatar, Card, Hanging};
 pub use model::detail::DetailedScene;
+pub use model::drawn_surface::{DRAWN_BEYOND, SurfacePoint};
 pub use model::known_poses::KnownPoses;
 pub use model::light::Light;
 pub use model::parameters::GaussianParameters;

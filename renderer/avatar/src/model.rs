@@ -3,6 +3,7 @@
 pub(crate) mod avatar;
 mod coarser;
 pub(crate) mod detail;
+pub(crate) mod drawn_surface;
 mod file;
 pub(crate) mod known_poses;
 pub(crate) mod light;

@@ -125,7 +125,7 @@ impl Folder {
         write_glb(
             &self.root.join("subject.glb"),
             simulator.template(),
-            GlbContents { track: Some(&track), texture: None },
+            GlbContents { track: Some(&track), ..GlbContents::default() },
         )?;
         let config = toml::to_string(simulator.config())
             .map_err(|error| refused(&self.root.join("simulation.toml"), &error.to_string()))?;

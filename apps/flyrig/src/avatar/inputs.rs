@@ -12,7 +12,7 @@ use flyrig_takes::{Replay, ReplaySettings};
 use crate::arguments::DatasetArgs;
 
 /// Loads an avatar, or the one in a file of `body.person` that a rig has learnt.
-pub(super) fn load(path: &Path) -> Result<Avatar> {
+pub(crate) fn load(path: &Path) -> Result<Avatar> {
     ensure!(path.exists(), "{} does not exist; `flyrig avatar build` makes an avatar", path.display());
     let learnt = || PersonMemory::load(path).ok()?.avatar().map(|avatar| (**avatar).clone());
     Avatar::load(path).or_else(|error| learnt().ok_or(error)).map_err(Into::into)
@@ -30,7 +30,7 @@ pub(super) fn print_far(share: f64) {
 }
 
 /// Opens a take to be tracked. With a known body, estimated poses move that body.
-pub(super) fn open_replay(
+pub(crate) fn open_replay(
     take: &DatasetArgs,
     holdout: &[String],
     (body, known): (&BodySettings, Option<&Template>),

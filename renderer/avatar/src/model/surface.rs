@@ -7,6 +7,8 @@ use rayon::prelude::*;
 
 use crate::edit::atlas::{REACH, Shown};
 use crate::model::avatar::Avatar;
+use crate::model::drawn_surface::DRAWN_BEYOND;
+use crate::model::posing::{Bones, PosedAvatar};
 
 /// Factors of the search radius that are tried in turn, where no Gaussian is near.
 const WIDER: [f32; 3] = [1.0, 3.0, 9.0];
@@ -63,6 +65,29 @@ impl Avatar {
         let rows = surface.triangle.par_iter().zip(&surface.barycentric).with_min_len(1024);
         rows.map(|row| color(row).filter(|color| color.is_finite()).unwrap_or(mean).max(Vec3::ZERO).to_array())
             .collect()
+    }
+}
+
+impl Avatar {
+    /// Returns the linear RGB of points near the drawn surface in the rest pose with the take's mean shape, given by canonical position
+    /// and unit normal: unlit colours of order zero, seen along the normal. The mean colour where no Gaussian is near and faces the
+    /// same way, and for points that are not finite.
+    #[must_use]
+    pub fn colors_at(&self, points: &[(Vec3, Vec3)]) -> Vec<[f32; 3]> {
+        let mut posed = PosedAvatar::default();
+        self.pose(&Bones::at_rest(&self.template.skeleton), None, &mut posed);
+        let place = posed.surface_points().map(|point| point.drawn(DRAWN_BEYOND)).collect();
+        let shown = Shown { place, ..Shown::of(self) };
+        let colors = self.constant_colors();
+        let mean = colors.iter().sum::<Vec3>() / colors.len().max(1) as f32;
+        let radius = REACH * shown.spacing(self);
+        let grid = PointGrid::new(&shown.place, radius);
+        let color = |at: &(Vec3, Vec3)| {
+            let is_finite = at.0.is_finite() && at.1.is_finite();
+            WIDER.iter().filter(|_| is_finite).find_map(|wider| shown.color_at(&grid, wider * radius, *at, &colors))
+        };
+        let rows = points.par_iter().with_min_len(1024);
+        rows.map(|at| color(at).filter(|color| color.is_finite()).unwrap_or(mean).max(Vec3::ZERO).to_array()).collect()
     }
 }
 
@@ -147,6 +172,23 @@ mod tests {
             (expected - Vec3::from(*color)).abs().max_element()
         });
         assert!(off.sum::<f32>() / (surface.len() as f32) < 0.05);
+    }
+
+    #[test]
+    fn points_on_the_drawn_surface_have_the_colors_of_the_gaussians_there() {
+        let avatar = painted();
+        let mut posed = PosedAvatar::default();
+        avatar.pose(&Bones::at_rest(&avatar.template.skeleton), None, &mut posed);
+        let points: Vec<(Vec3, Vec3)> =
+            posed.surface_points().map(|point| (point.drawn(DRAWN_BEYOND), point.normal)).collect();
+        let colors = avatar.colors_at(&points);
+        let rows = colors.iter().zip(avatar.constant_colors());
+        let off = rows.map(|(found, own)| (Vec3::from(*found) - own).abs().max_element()).sum::<f32>();
+        // A Gaussian's own colour, mixed with its neighbours'.
+        assert!(off / (colors.len() as f32) < 0.06, "{}", off / colors.len() as f32);
+        let poisoned = avatar.colors_at(&[(Vec3::NAN, Vec3::Y), (Vec3::splat(9.0), Vec3::Y)]);
+        assert_eq!(poisoned[0].map(f32::to_bits), poisoned[1].map(f32::to_bits));
+        assert!(poisoned[0].iter().all(|value| value.is_finite()));
     }
 
     #[test]

@@ -1,0 +1,92 @@
+//! `flyrig mesh`: the person of a take, or an avatar, as a closed mesh with bones.
+
+mod source;
+mod write;
+
+use std::{
+    path::{Path, PathBuf},
+    time::Instant,
+};
+
+use anyhow::{Context as _, Result, ensure};
+use clap::{Args, ValueEnum};
+use flyrig_gpu::GpuContext;
+use flyrig_mesh::{Fusion, MeshOptions, MeshedPerson};
+
+use crate::arguments::DatasetArgs;
+use source::Source;
+use write::MeshFolder;
+
+/// Default number of Gaussians, as a rig draws.
+const GAUSSIANS: u32 = 115_000;
+/// Default steps of the fit.
+const STEPS: u64 = 400;
+
+/// Arguments of `flyrig mesh`.
+#[derive(Debug, Clone, Args)]
+pub struct MeshArgs {
+    #[command(flatten)]
+    pub take: DatasetArgs,
+    /// Folder of the mesh; it must be new or empty.
+    #[arg(long)]
+    pub out: PathBuf,
+    /// Gaussians on the person's surface while a take is tracked and fitted.
+    #[arg(long, default_value_t = GAUSSIANS, value_parser = clap::value_parser!(u32).range(1000..=1_000_000))]
+    pub gaussians: u32,
+    /// Steps in which the Gaussians are fitted to all images of a take; 0 meshes the tracked surface.
+    #[arg(long, default_value_t = STEPS, value_parser = clap::value_parser!(u64).range(0..=1_000_000))]
+    pub steps: u64,
+    /// Fusion of the Gaussians' surfaces into one.
+    #[arg(long, value_enum, default_value = "hgm")]
+    pub fusion: FusionKind,
+    /// Side of a voxel, millimetres; twice the distance of neighbouring Gaussians if not given.
+    #[arg(long, value_parser = parse_voxel)]
+    pub voxel: Option<f32>,
+    /// Write the surface of every frame of a take, in place of every tenth.
+    #[arg(long)]
+    pub sequence: bool,
+}
+
+/// Fusion of oriented points.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, ValueEnum)]
+pub enum FusionKind {
+    /// Weights that fall with the distance, of points that face the same way (HGM, Eq. 18).
+    Hgm,
+    /// Equal weights of all points within the truncation distance.
+    Naive,
+}
+
+fn parse_voxel(text: &str) -> Result<f32, String> {
+    match text.parse::<f32>() {
+        Ok(side) if (1.0..=50.0).contains(&side) => Ok(side / 1000.0),
+        _ => Err(format!("'{text}' is not between 1 and 50 millimetres")),
+    }
+}
+
+/// Runs the command.
+pub fn mesh(args: &MeshArgs, gpu: &dyn Fn() -> Result<GpuContext>) -> Result<()> {
+    check_target(&args.out)?;
+    let source = Source::open(args, gpu)?;
+    let started = Instant::now();
+    let options = MeshOptions {
+        fusion: match args.fusion {
+            FusionKind::Hgm => Fusion::Hgm,
+            FusionKind::Naive => Fusion::Naive,
+        },
+        voxel_m: args.voxel,
+        ..MeshOptions::default()
+    };
+    let (person, report) = MeshedPerson::of_avatar(&source.avatar, &options)
+        .with_context(|| format!("no mesh of {}", args.take.dataset.display()))?;
+    let seconds = started.elapsed().as_secs_f64();
+    MeshFolder { out: &args.out, source: &source, person: &person, report: &report, seconds, args }.write()
+}
+
+/// Checks that the folder can be written to, before any work.
+fn check_target(out: &Path) -> Result<()> {
+    let parent = out.parent().filter(|folder| !folder.as_os_str().is_empty()).unwrap_or(Path::new("."));
+    ensure!(parent.is_dir(), "the folder {} does not exist; make it, or choose another --out", parent.display());
+    let taken = out.is_file() || std::fs::read_dir(out).is_ok_and(|mut entries| entries.next().is_some());
+    ensure!(!taken, "{} exists already; remove it, or choose another --out", out.display());
+    Ok(())
+}

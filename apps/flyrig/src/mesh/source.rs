@@ -1,0 +1,76 @@
+//! Avatar that is meshed: one from a file, or that of a take's person, tracked and fitted.
+
+use std::time::Instant;
+
+use anyhow::{Context as _, Result, ensure};
+use flyrig_avatar::{Avatar, AvatarFitSettings, AvatarModel, TrainingFrame};
+use flyrig_fit::{Fit, FitSettings};
+use flyrig_fusion::BodySettings;
+use flyrig_gpu::GpuContext;
+use flyrig_renderer::HarmonicOrder;
+use flyrig_report::{progress_bar, stop};
+use flyrig_takes::AvatarTake;
+
+use super::MeshArgs;
+use crate::avatar::{load, open_replay};
+
+/// Avatar, and the frames of its take.
+pub(super) struct Source {
+    pub avatar: Avatar,
+    /// Frames in which the person was found; none for an avatar from a file.
+    pub frames: Vec<TrainingFrame>,
+    /// Number of the first frame.
+    pub first: u64,
+    /// Frames per second of the take.
+    pub fps: f64,
+    /// Seconds of tracking and of the fit.
+    pub tracked_s: f64,
+    pub fitted_s: f64,
+}
+
+impl Source {
+    /// Opens the avatar or tracks the take.
+    pub fn open(args: &MeshArgs, gpu: &dyn Fn() -> Result<GpuContext>) -> Result<Self> {
+        let path = &args.take.dataset;
+        if path.extension().is_some_and(|extension| extension == "flyavatar" || extension == "person") {
+            ensure!(
+                args.take.inputs.is_empty() && !args.sequence,
+                "{} is an avatar and not a take: leave out --inputs and --sequence",
+                path.display()
+            );
+            let avatar = load(path)?;
+            return Ok(Self { avatar, frames: Vec::new(), first: 0, fps: 30.0, tracked_s: 0.0, fitted_s: 0.0 });
+        }
+        Self::track(args, &gpu()?.fastest())
+    }
+
+    fn track(args: &MeshArgs, gpu: &GpuContext) -> Result<Self> {
+        let started = Instant::now();
+        let take_args = args.take.resolve("mesh", &[], gpu)?;
+        let body = BodySettings { gaussians: args.gaussians as usize, ..BodySettings::default() };
+        let mut replay = open_replay(&take_args, &[], (&body, None), gpu)?;
+        let take = AvatarTake::track(&mut replay, &body, HarmonicOrder::Zero, |_, _| Ok(()))
+            .with_context(|| format!("no mesh of {}", take_args.dataset.display()))?;
+        let AvatarTake { frames, views, avatar, numbers, .. } = take;
+        let tracked_s = started.elapsed().as_secs_f64();
+        println!("tracked {} frames in {tracked_s:.0} s", frames.len());
+        drop(replay);
+        let started = Instant::now();
+        let avatar = if args.steps == 0 {
+            avatar
+        } else {
+            let model = AvatarModel::new(avatar, frames.clone(), AvatarFitSettings::default());
+            let mut fit = Fit::new(gpu, model, views, FitSettings::default())?;
+            let bar = progress_bar(args.steps, "fit");
+            for step in 0..args.steps {
+                ensure!(!stop::requested(), "stopped; nothing was written");
+                fit.step(step as f32 / args.steps as f32)?;
+                bar.inc(1);
+            }
+            bar.finish_and_clear();
+            fit.into_model().into_avatar()
+        };
+        let fitted_s = started.elapsed().as_secs_f64();
+        Ok(Self { avatar, frames, first: numbers[0], fps: take_args.rate.fps, tracked_s, fitted_s })
+    }
+}

@@ -1,0 +1,139 @@
+//! Files of a meshed person.
+
+use std::path::Path;
+
+use anyhow::{Context as _, Result};
+use flyrig_body::{GlbContents, write_glb, write_mesh_ply};
+use flyrig_mesh::{MeshedPerson, PersonReport};
+use flyrig_report::write_whole;
+use flyrig_types::PoseTrack;
+use glam::DQuat;
+use serde_json::json;
+
+use super::{MeshArgs, source::Source};
+
+/// Frames from one written surface to the next, as `flyrig eval` writes them.
+const SURFACE_EVERY: u64 = 10;
+
+/// Folder that is written.
+pub(super) struct MeshFolder<'a> {
+    pub out: &'a Path,
+    pub source: &'a Source,
+    pub person: &'a MeshedPerson,
+    pub report: &'a PersonReport,
+    /// Seconds of fusion, surface and skin.
+    pub seconds: f64,
+    pub args: &'a MeshArgs,
+}
+
+impl MeshFolder<'_> {
+    /// Writes all files to a folder beside the target, which appears whole or not at all.
+    pub fn write(&self) -> Result<()> {
+        let mut name = self.out.file_name().context("--out names no folder")?.to_owned();
+        name.push(".partial");
+        let partial = self.out.with_file_name(name);
+        let written = self.write_to(&partial).and_then(|()| {
+            // An empty folder of this name may be there.
+            let _ = std::fs::remove_dir(self.out);
+            std::fs::rename(&partial, self.out).with_context(|| format!("cannot write {}", self.out.display()))
+        });
+        if written.is_err() {
+            // The first error is the one worth reporting.
+            let _ = std::fs::remove_dir_all(&partial);
+        }
+        written?;
+        self.print();
+        Ok(())
+    }
+
+    fn write_to(&self, folder: &Path) -> Result<()> {
+        std::fs::create_dir_all(folder).with_context(|| format!("cannot create {}", folder.display()))?;
+        let track = self.track()?;
+        let colors = self.person.colors(&self.source.avatar);
+        let contents = GlbContents { track: track.as_ref(), colors: Some(&colors), texture: None };
+        write_glb(&folder.join("mesh.glb"), &self.person.template, contents)?;
+        self.write_surfaces(folder)?;
+        Ok(write_whole(&folder.join("metrics.json"), &serde_json::to_vec_pretty(&self.metrics())?)?)
+    }
+
+    /// Returns the tracked motion with y up.
+    fn track(&self) -> Result<Option<PoseTrack>> {
+        let step = 1e9 / self.source.fps;
+        let turn = DQuat::from_rotation_x(-std::f64::consts::FRAC_PI_2);
+        let keys = self.source.frames.iter().enumerate().map(|(i, frame)| {
+            let mut pose = frame.pose.clone();
+            pose.root_translation = turn * pose.root_translation;
+            if let Some(root) = pose.joint_rotations.first_mut() {
+                *root = (turn * *root).normalize();
+            }
+            ((i as f64 * step) as i64, pose)
+        });
+        let keys: Vec<_> = keys.collect();
+        Ok(if keys.is_empty() { None } else { Some(PoseTrack::new(keys)?) })
+    }
+
+    /// Writes the surface of the frames, in the take's own axes.
+    fn write_surfaces(&self, folder: &Path) -> Result<()> {
+        let every = if self.args.sequence { 1 } else { SURFACE_EVERY };
+        let numbers = self.source.first..;
+        let chosen = numbers.zip(&self.source.frames).filter(|(number, _)| number.is_multiple_of(every));
+        std::fs::create_dir_all(folder.join("surface"))?;
+        for (number, frame) in chosen {
+            let (positions, normals) = self.person.posed(&frame.pose, Some(&frame.translations));
+            let path = folder.join(format!("surface/{number:06}.ply"));
+            write_mesh_ply(&path, &positions, &normals, &self.person.template.triangles, &[])?;
+        }
+        Ok(())
+    }
+
+    fn metrics(&self) -> serde_json::Value {
+        let (mesh, skin) = (&self.report.mesh, &self.report.skin);
+        let (topology, seconds) = (&mesh.topology, &mesh.seconds);
+        json!({
+            "take": self.args.take.dataset.display().to_string(),
+            "gaussians": mesh.points,
+            "dropped": mesh.dropped.total(),
+            "vertices": topology.vertices,
+            "triangles": topology.triangles,
+            "closed_manifold": topology.is_closed_manifold(),
+            "components": topology.components,
+            "genus": topology.genus(),
+            "self_intersections": topology.self_intersections,
+            "area_m2": topology.area_m2,
+            "volume_m3": topology.volume_m3,
+            "hole_share": mesh.hole_share,
+            "voxel_mm": 1e3 * mesh.settings.voxel_m,
+            "truncation_mm": 1e3 * mesh.settings.truncation_m,
+            "angle_rad": mesh.settings.angle_rad,
+            "decay_mm": 1e3 * mesh.settings.decay_m,
+            "blocks": mesh.blocks,
+            "skipped_blocks": mesh.skipped_blocks,
+            "skin": { "taken": skin.taken, "inpainted": skin.inpainted, "isolated": skin.isolated },
+            "seconds": {
+                "tracking": self.source.tracked_s,
+                "fit": self.source.fitted_s,
+                "density": seconds.density,
+                "fusion": seconds.fuse,
+                "signs": seconds.signs,
+                "surface": seconds.surface,
+                "components": seconds.components,
+                "topology": seconds.topology,
+                "all_after_tracking_and_fit": self.seconds,
+            },
+        })
+    }
+
+    fn print(&self) {
+        let (mesh, topology) = (&self.report.mesh, &self.report.mesh.topology);
+        println!(
+            "{} triangles from {} Gaussians at voxels of {:.1} mm in {:.1} s; {:.1} % of the surface closes holes, {} self-intersections; {}",
+            topology.triangles,
+            mesh.points,
+            1e3 * mesh.settings.voxel_m,
+            self.seconds,
+            100.0 * mesh.hole_share,
+            topology.self_intersections,
+            self.out.join("mesh.glb").display()
+        );
+    }
+}
