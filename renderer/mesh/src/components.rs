@@ -24,21 +24,24 @@ impl Removed {
     }
 }
 
-/// Keeps the `bodies` components of the largest volume. Floaters and cavities are removed, which fills the latter.
+/// Keeps the `bodies` components of the largest volume. Floaters and cavities are removed, which fills the latter, as are
+/// triangles with vertices out of range.
 ///
 /// # Errors
 /// [`MeshError::NoSurface`] if no component encloses a volume, and [`MeshError::SeveralBodies`] if more than `bodies`
 /// components have at least 0.3 of the largest volume.
 pub fn keep_largest(mesh: &TriMesh, bodies: usize) -> Result<(TriMesh, Removed), MeshError> {
     let mut parts = UnionFind::new(mesh.positions.len());
-    for [a, b, c] in &mesh.triangles {
-        parts.join(*a as usize, *b as usize);
-        parts.join(*a as usize, *c as usize);
+    let valid = |triangle: &[u32; 3]| triangle.iter().all(|vertex| (*vertex as usize) < mesh.positions.len());
+    let rows: Vec<usize> = (0..mesh.triangles.len()).filter(|i| valid(&mesh.triangles[*i])).collect();
+    for [a, b, c] in rows.iter().map(|row| mesh.triangles[*row]) {
+        parts.join(a as usize, b as usize);
+        parts.join(a as usize, c as usize);
     }
     let mut volumes = vec![0.0; mesh.positions.len()];
-    let roots: Vec<usize> = mesh.triangles.iter().map(|triangle| parts.root(triangle[0] as usize)).collect();
-    for (i, root) in roots.iter().enumerate() {
-        volumes[*root] += signed_volume(mesh.corners(i));
+    let roots: Vec<usize> = rows.iter().map(|row| parts.root(mesh.triangles[*row][0] as usize)).collect();
+    for (row, root) in rows.iter().zip(&roots) {
+        volumes[*root] += signed_volume(mesh.corners(*row));
     }
     let mut order: Vec<usize> = roots.clone();
     order.sort_unstable();
@@ -102,6 +105,11 @@ mod tests {
     fn floaters_and_cavities_are_removed() {
         let (kept, removed) = keep_largest(&tetrahedra(&[0.3, 1.0, -0.5]), 1).unwrap();
         assert_eq!((kept.triangles.len(), kept.positions[0], kept.from_hole[0]), (4, Vec3::X * 9.0, false));
+        let mut poisoned = tetrahedra(&[1.0]);
+        poisoned.triangles.push([0, 1, 99]);
+        assert_eq!(keep_largest(&poisoned, 1).unwrap().1.triangles, 1);
+        poisoned.positions[1] = Vec3::NAN;
+        assert_eq!(keep_largest(&poisoned, 1).unwrap_err(), MeshError::NoSurface);
         assert_eq!((removed.volumes_m3.len(), removed.cavities(), removed.triangles), (2, 1, 8));
     }
 

@@ -7,8 +7,9 @@ use crate::point_grid::PointGrid;
 use crate::points::OrientedPoints;
 use crate::settings::{Fusion, FusionSettings};
 
-use super::blocks::{Evidence, Field, SIDE, voxel_of};
+use super::blocks::{Evidence, Field};
 use super::evidence::Nearby;
+use super::lattice::{SIDE, voxel_of};
 
 /// Voxels along the side of a brick, whose voxels share one selection of points.
 const BRICK: i32 = 2;

@@ -3,7 +3,8 @@
 mod blocks;
 mod evidence;
 mod fuse;
+mod lattice;
 
 pub use blocks::{Evidence, Field, Voxel};
-pub(crate) use blocks::{SIDE, VOXELS, local_of, voxel_of};
 pub use fuse::fuse;
+pub(crate) use lattice::{SIDE, VOXELS, local_of, voxel_of};
