@@ -11,7 +11,7 @@ use std::{
 use anyhow::{Context as _, Result, ensure};
 use clap::{Args, ValueEnum};
 use flyrig_gpu::GpuContext;
-use flyrig_mesh::{Fusion, MeshOptions, MeshedPerson};
+use flyrig_mesh::{Fusion, MeshOptions, MeshedPerson, PersonOptions};
 
 use crate::arguments::DatasetArgs;
 use source::Source;
@@ -42,7 +42,13 @@ pub struct MeshArgs {
     /// Side of a voxel, millimetres; twice the distance of neighbouring Gaussians if not given.
     #[arg(long, value_parser = parse_voxel)]
     pub voxel: Option<f32>,
-    /// Write the surface of every frame of a take, in place of every tenth.
+    /// Triangles of the mesh, at most.
+    #[arg(long, default_value_t = 60_000, value_parser = clap::value_parser!(u32).range(500..=5_000_000))]
+    pub triangles: u32,
+    /// Texels along a side of the texture.
+    #[arg(long, default_value_t = 2048, value_parser = clap::value_parser!(u32).range(64..=4096))]
+    pub texture: u32,
+    /// Write the surface of every frame of a take, in place of every tenth, and of all frames as one USD file.
     #[arg(long)]
     pub sequence: bool,
 }
@@ -68,7 +74,7 @@ pub fn mesh(args: &MeshArgs, gpu: &dyn Fn() -> Result<GpuContext>) -> Result<()>
     check_target(&args.out)?;
     let source = Source::open(args, gpu)?;
     let started = Instant::now();
-    let options = MeshOptions {
+    let mesh = MeshOptions {
         fusion: match args.fusion {
             FusionKind::Hgm => Fusion::Hgm,
             FusionKind::Naive => Fusion::Naive,
@@ -76,6 +82,7 @@ pub fn mesh(args: &MeshArgs, gpu: &dyn Fn() -> Result<GpuContext>) -> Result<()>
         voxel_m: args.voxel,
         ..MeshOptions::default()
     };
+    let options = PersonOptions { mesh, triangles: args.triangles as usize, texture_side: args.texture };
     let (person, report) = MeshedPerson::of_avatar(&source.avatar, &options)
         .with_context(|| format!("no mesh of {}", args.take.dataset.display()))?;
     let seconds = started.elapsed().as_secs_f64();

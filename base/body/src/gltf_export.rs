@@ -14,8 +14,6 @@ pub struct GlbContents<'a> {
     pub track: Option<&'a PoseTrack>,
     /// Texture as a PNG file; the material is unlit.
     pub texture: Option<&'a [u8]>,
-    /// Linear RGB of each vertex, for a lit material.
-    pub colors: Option<&'a [[f32; 3]]>,
 }
 
 /// Writes a skinned mesh atomically, in the form that [`crate::load_gltf`] reads.
@@ -63,9 +61,6 @@ pub fn write_glb(path: &Path, template: &Template, contents: GlbContents<'_>) ->
         "attributes": { "POSITION": positions, "NORMAL": normals, "TEXCOORD_0": uvs, "JOINTS_0": joints, "WEIGHTS_0": weights },
         "indices": indices,
     });
-    if let Some(colors) = contents.colors.filter(|colors| colors.len() == template.positions.len()) {
-        primitive["attributes"]["COLOR_0"] = json!(glb.floats(colors.as_flattened(), "VEC3", 3));
-    }
     let mut document = json!({
         "scene": 0,
         "scenes": [{ "nodes": [0, bones.len()] }],

@@ -17,6 +17,7 @@ mod local;
 mod model;
 
 pub use edit::atlas::{Atlas, DEFAULT_ATLAS_SIDE};
+pub use edit::bake::BakedMesh;
 pub use edit::paint::Painted;
 pub use error::AvatarError;
 pub use fit::avatar_model::{AvatarFitSettings, AvatarModel, TrainingFrame};

@@ -10,6 +10,9 @@
 //! 4. [`marching_cubes`]: the surface, manifold by construction.
 //! 5. [`keep_largest`]: removal of floaters and cavities.
 //!
+//! [`decimate`] simplifies the mesh, [`mesh_atlas`] gives it texture coordinates, and writers make files for other programs:
+//! [`write_obj`], [`write_3mf`], [`write_usdz`], [`write_usd_sequence`].
+//!
 //! [`Topology`] verifies the result. [`skin_weights`] ties a mesh to a skeleton. [`Normalization`] brings Gaussians to unit size (HGM, Eq. 1) and back.
 //!
 //! ```
@@ -28,40 +31,58 @@
 //! # Ok::<(), flyrig_mesh::MeshError>(())
 //! ```
 
+mod atlas;
 mod carve;
 mod components;
+mod connectivity;
+mod decimate;
 mod density;
 mod error;
 mod extract;
+mod fault;
 mod field;
+mod files;
 mod intersections;
 mod marching_cubes;
 mod mesh;
+mod nearest;
 mod normalization;
 mod person;
 mod point_grid;
 mod points;
 mod settings;
+#[cfg(test)]
+mod shapes;
 mod signs;
 mod skin;
 mod topology;
 mod union_find;
+mod visible;
 mod winding;
 
+pub use atlas::{AtlasError, AtlasSettings, MeshAtlas, mesh_atlas};
 pub use carve::{Empty, carve};
 pub use components::{Removed, keep_largest};
+pub use connectivity::Connectivity;
+pub use decimate::{DecimateError, Decimated, decimate};
 pub use density::Density;
 pub use error::MeshError;
 pub use extract::{MeshOptions, MeshReport, MeshSeconds, mesh_from_points};
+pub use fault::MeshFault;
 pub use field::{Evidence, Field, Voxel, fuse};
+pub use files::{
+    JointFrame, MeshFile, MeshFileError, MeshFrame, MeshJoint, MeshSkeleton, write_3mf, write_obj, write_usd_sequence,
+    write_usdz,
+};
 pub use intersections::self_intersections;
 pub use marching_cubes::marching_cubes;
 pub use mesh::TriMesh;
 pub use normalization::{Normalization, clamped_scales};
-pub use person::{MeshedPerson, PersonReport};
+pub use person::{MeshedPerson, PersonError, PersonOptions, PersonReport};
 pub use points::{Dropped, OrientedPoint, OrientedPoints};
 pub use settings::{Fusion, FusionSettings};
 pub use signs::close;
 pub use skin::{SkinReport, SkinSettings, skin_weights};
 pub use topology::Topology;
+pub use visible::visible;
 pub use winding::Winding;

@@ -1,8 +1,8 @@
 //! Topology of triangle meshes.
 
+use crate::connectivity::Connectivity;
 use crate::intersections::self_intersections;
 use crate::mesh::{TriMesh, area_vector};
-use crate::union_find::UnionFind;
 
 /// Height of a triangle over its longest side below which it counts as degenerate.
 const FLAT: f64 = 1e-9;
@@ -42,17 +42,22 @@ impl Topology {
     #[must_use]
     pub fn measure(mesh: &TriMesh) -> Self {
         let valid = |triangle: &[u32; 3]| triangle.iter().all(|vertex| (*vertex as usize) < mesh.positions.len());
-        let rows: Vec<usize> = (0..mesh.triangles.len()).filter(|i| valid(&mesh.triangles[*i])).collect();
-        let mut topology = Self {
+        let used: Vec<[u32; 3]> = mesh.triangles.iter().copied().filter(valid).collect();
+        let of = Connectivity::new(&used);
+        Self {
+            vertices: of.vertices,
+            edges: of.edges,
+            boundary_edges: of.open_edges,
+            non_manifold_edges: of.crowded_edges,
+            inconsistent_edges: of.twisted_edges,
+            non_manifold_vertices: of.pinched_vertices,
+            components: of.components,
             triangles: mesh.triangles.len(),
             degenerate_triangles: (0..mesh.triangles.len()).filter(|i| is_degenerate(mesh, *i)).count(),
             self_intersections: self_intersections(mesh),
             area_m2: mesh.area(),
             volume_m3: mesh.volume(),
-            ..Self::default()
-        };
-        topology.count_edges(mesh, &rows);
-        topology
+        }
     }
 
     /// Returns whether the mesh is closed, manifold and consistently oriented.
@@ -71,48 +76,6 @@ impl Topology {
     #[must_use]
     pub fn genus(&self) -> Option<i64> {
         self.is_closed_manifold().then(|| self.components as i64 - self.euler_characteristic() / 2)
-    }
-
-    fn count_edges(&mut self, mesh: &TriMesh, rows: &[usize]) {
-        // Per side: its vertices in ascending order, whether it descends, and the corners at these vertices.
-        let mut sides: Vec<([u32; 2], bool, [u32; 2])> = Vec::with_capacity(rows.len() * 3);
-        let mut used = vec![false; mesh.positions.len()];
-        let mut parts = UnionFind::new(mesh.positions.len());
-        for row in rows {
-            let triangle = mesh.triangles[*row];
-            for i in 0..3 {
-                let (from, to) = (triangle[i], triangle[(i + 1) % 3]);
-                let corners = [i, (i + 1) % 3].map(|corner| (row * 3 + corner) as u32);
-                used[from as usize] = true;
-                parts.join(from as usize, to as usize);
-                sides.push(match from <= to {
-                    true => ([from, to], false, corners),
-                    false => ([to, from], true, [corners[1], corners[0]]),
-                });
-            }
-        }
-        sides.sort_unstable();
-        let mut fans = UnionFind::new(mesh.triangles.len() * 3);
-        for edge in sides.chunk_by(|a, b| a.0 == b.0) {
-            self.edges += 1;
-            self.boundary_edges += usize::from(edge.len() == 1);
-            self.non_manifold_edges += usize::from(edge.len() > 2);
-            self.inconsistent_edges += usize::from(edge.len() == 2 && edge[0].1 == edge[1].1);
-            for pair in edge.windows(2) {
-                fans.join(pair[0].2[0] as usize, pair[1].2[0] as usize);
-                fans.join(pair[0].2[1] as usize, pair[1].2[1] as usize);
-            }
-        }
-        self.vertices = used.iter().filter(|used| **used).count();
-        self.components = (0..used.len()).filter(|vertex| used[*vertex] && parts.root(*vertex) == *vertex).count();
-        let mut fans_at = vec![0u32; mesh.positions.len()];
-        for row in rows {
-            for (i, vertex) in mesh.triangles[*row].iter().enumerate() {
-                let corner = row * 3 + i;
-                fans_at[*vertex as usize] += u32::from(fans.root(corner) == corner);
-            }
-        }
-        self.non_manifold_vertices = fans_at.iter().filter(|fans| **fans > 1).count();
     }
 }
 

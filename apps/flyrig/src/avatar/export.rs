@@ -82,7 +82,7 @@ fn mesh(avatar: &Avatar, args: &AvatarExportArgs) -> Result<()> {
     let motion = args.motion.as_deref().map(|motion| DrivenMotion::load(&surface, motion)).transpose()?;
     let track = motion.map(|motion| y_up(motion.track())).transpose()?;
     surface.normals = avatar.template.normals_at(&surface.positions);
-    write_glb(&args.out, &surface, GlbContents { track: track.as_ref(), texture: Some(&texture), colors: None })?;
+    write_glb(&args.out, &surface, GlbContents { track: track.as_ref(), texture: Some(&texture) })?;
     let (vertices, joints) = (surface.positions.len(), surface.skeleton.joints().len());
     println!("textured mesh of {vertices} vertices with {joints} joints in {}", args.out.display());
     Ok(())

@@ -10,6 +10,7 @@ use flyrig_gpu::GpuContext;
 use flyrig_renderer::HarmonicOrder;
 use flyrig_report::{progress_bar, stop};
 use flyrig_takes::AvatarTake;
+use glam::{DQuat, DVec3};
 
 use super::MeshArgs;
 use crate::avatar::{load, open_replay};
@@ -23,6 +24,8 @@ pub(super) struct Source {
     pub first: u64,
     /// Frames per second of the take.
     pub fps: f64,
+    /// Upward direction of the take's world.
+    pub up: DVec3,
     /// Seconds of tracking and of the fit.
     pub tracked_s: f64,
     pub fitted_s: f64,
@@ -39,9 +42,22 @@ impl Source {
                 path.display()
             );
             let avatar = load(path)?;
-            return Ok(Self { avatar, frames: Vec::new(), first: 0, fps: 30.0, tracked_s: 0.0, fitted_s: 0.0 });
+            return Ok(Self {
+                avatar,
+                frames: Vec::new(),
+                first: 0,
+                fps: 30.0,
+                up: DVec3::Z,
+                tracked_s: 0.0,
+                fitted_s: 0.0,
+            });
         }
         Self::track(args, &gpu()?.fastest())
+    }
+
+    /// Returns the rotation of the take's world to y up.
+    pub fn y_up(&self) -> DQuat {
+        DQuat::from_rotation_arc(self.up.normalize_or(DVec3::Z), DVec3::Y)
     }
 
     fn track(args: &MeshArgs, gpu: &GpuContext) -> Result<Self> {
@@ -54,6 +70,7 @@ impl Source {
         let AvatarTake { frames, views, avatar, numbers, .. } = take;
         let tracked_s = started.elapsed().as_secs_f64();
         println!("tracked {} frames in {tracked_s:.0} s", frames.len());
+        let up = replay.session.rig().world_up;
         drop(replay);
         let started = Instant::now();
         let avatar = if args.steps == 0 {
@@ -71,6 +88,6 @@ impl Source {
             fit.into_model().into_avatar()
         };
         let fitted_s = started.elapsed().as_secs_f64();
-        Ok(Self { avatar, frames, first: numbers[0], fps: take_args.rate.fps, tracked_s, fitted_s })
+        Ok(Self { avatar, frames, first: numbers[0], fps: take_args.rate.fps, up, tracked_s, fitted_s })
     }
 }

@@ -4,10 +4,13 @@ use std::path::Path;
 
 use anyhow::{Context as _, Result};
 use flyrig_body::{GlbContents, write_glb, write_mesh_ply};
-use flyrig_mesh::{MeshedPerson, PersonReport};
-use flyrig_report::write_whole;
+use flyrig_mesh::{
+    JointFrame, MeshFile, MeshFrame, MeshJoint, MeshSkeleton, MeshedPerson, PersonReport, write_3mf, write_obj,
+    write_usd_sequence, write_usdz,
+};
+use flyrig_report::{png, write_whole};
 use flyrig_types::PoseTrack;
-use glam::DQuat;
+use glam::{DMat4, Quat, Vec3};
 use serde_json::json;
 
 use super::{MeshArgs, source::Source};
@@ -48,18 +51,86 @@ impl MeshFolder<'_> {
 
     fn write_to(&self, folder: &Path) -> Result<()> {
         std::fs::create_dir_all(folder).with_context(|| format!("cannot create {}", folder.display()))?;
-        let track = self.track()?;
-        let colors = self.person.colors(&self.source.avatar);
-        let contents = GlbContents { track: track.as_ref(), colors: Some(&colors), texture: None };
-        write_glb(&folder.join("mesh.glb"), &self.person.template, contents)?;
+        let (track, template) = (self.track()?, &self.person.template);
+        let texture = png::encode_rgb(&self.person.texture.rgb, self.person.texture.side, self.person.texture.side)?;
+        let contents = GlbContents { track: track.as_ref(), texture: Some(&texture) };
+        write_glb(&folder.join("mesh.glb"), template, contents)?;
+        let file = MeshFile {
+            positions: &template.positions,
+            normals: &template.normals,
+            uvs: &template.uvs,
+            triangles: &template.triangles,
+            texture: Some(&texture),
+            skeleton: None,
+        };
+        write_obj(&folder.join("mesh.obj"), &file)?;
+        self.write_rigged(&folder.join("mesh.usdz"), &file, track.as_ref())?;
+        write_3mf(&folder.join("mesh.3mf"), &file)?;
+        if self.args.sequence {
+            self.write_sequence(&folder.join("sequence.usda"), &file)?;
+        }
         self.write_surfaces(folder)?;
         Ok(write_whole(&folder.join("metrics.json"), &serde_json::to_vec_pretty(&self.metrics())?)?)
+    }
+
+    /// Writes mesh, bones and motion as USDZ.
+    fn write_rigged(&self, path: &Path, file: &MeshFile<'_>, track: Option<&PoseTrack>) -> Result<()> {
+        let bones = self.person.template.skeleton.joints();
+        let joints: Vec<MeshJoint<'_>> = bones
+            .iter()
+            .map(|joint| MeshJoint {
+                name: &joint.name,
+                parent: joint.parent,
+                mesh_from_joint: joint.joint_from_canonical.inverse().as_mat4(),
+                parent_from_joint: DMat4::from_rotation_translation(joint.rest_rotation, joint.rest_translation)
+                    .as_mat4(),
+            })
+            .collect();
+        let (indices, weights): (Vec<_>, Vec<_>) =
+            self.person.template.skin.iter().map(|skin| (skin.joints, skin.weights)).unzip();
+        let poses: Vec<(f64, Vec<Vec3>, Vec<Quat>)> = track
+            .map(PoseTrack::keys)
+            .unwrap_or_default()
+            .iter()
+            .map(|(nanos, pose)| {
+                let mut translations: Vec<Vec3> = bones.iter().map(|joint| joint.rest_translation.as_vec3()).collect();
+                translations.iter_mut().take(1).for_each(|root| *root = pose.root_translation.as_vec3());
+                (*nanos as f64 * 1e-9, translations, pose.joint_rotations.iter().map(|turn| turn.as_quat()).collect())
+            })
+            .collect();
+        let frames: Vec<JointFrame<'_>> = poses
+            .iter()
+            .map(|(secs, translations, rotations)| JointFrame { secs: *secs, translations, rotations })
+            .collect();
+        let skeleton = MeshSkeleton { joints: &joints, indices: &indices, weights: &weights, frames: &frames };
+        Ok(write_usdz(path, &MeshFile { skeleton: Some(skeleton), ..*file })?)
+    }
+
+    /// Writes the surface of all frames as one USD stage, y up.
+    fn write_sequence(&self, path: &Path, file: &MeshFile<'_>) -> Result<()> {
+        let turn = self.source.y_up().as_quat();
+        let posed: Vec<(Vec<Vec3>, Vec<Vec3>)> = self
+            .source
+            .frames
+            .iter()
+            .map(|frame| {
+                let (mut positions, mut normals) = self.person.posed(&frame.pose, Some(&frame.translations));
+                positions.iter_mut().chain(&mut normals).for_each(|vector| *vector = turn * *vector);
+                (positions, normals)
+            })
+            .collect();
+        let frames: Vec<MeshFrame<'_>> = posed
+            .iter()
+            .enumerate()
+            .map(|(i, (positions, normals))| MeshFrame { secs: i as f64 / self.source.fps, positions, normals })
+            .collect();
+        Ok(write_usd_sequence(path, file, &frames)?)
     }
 
     /// Returns the tracked motion with y up.
     fn track(&self) -> Result<Option<PoseTrack>> {
         let step = 1e9 / self.source.fps;
-        let turn = DQuat::from_rotation_x(-std::f64::consts::FRAC_PI_2);
+        let turn = self.source.y_up();
         let keys = self.source.frames.iter().enumerate().map(|(i, frame)| {
             let mut pose = frame.pose.clone();
             pose.root_translation = turn * pose.root_translation;
@@ -88,11 +159,13 @@ impl MeshFolder<'_> {
 
     fn metrics(&self) -> serde_json::Value {
         let (mesh, skin) = (&self.report.mesh, &self.report.skin);
-        let (topology, seconds) = (&mesh.topology, &mesh.seconds);
+        let (topology, seconds, [simplified_s, tied_s, textured_s]) =
+            (&self.report.topology, &mesh.seconds, self.report.seconds);
         json!({
             "take": self.args.take.dataset.display().to_string(),
             "gaussians": mesh.points,
             "dropped": mesh.dropped.total(),
+            "hidden": mesh.dropped.hidden,
             "vertices": topology.vertices,
             "triangles": topology.triangles,
             "closed_manifold": topology.is_closed_manifold(),
@@ -101,6 +174,10 @@ impl MeshFolder<'_> {
             "self_intersections": topology.self_intersections,
             "area_m2": topology.area_m2,
             "volume_m3": topology.volume_m3,
+            "fused_triangles": mesh.topology.triangles,
+            "simplified_by_mm": 1e3 * self.report.simplified_by_m,
+            "charts": self.report.charts,
+            "texture_coverage": self.report.coverage,
             "hole_share": mesh.hole_share,
             "voxel_mm": 1e3 * mesh.settings.voxel_m,
             "truncation_mm": 1e3 * mesh.settings.truncation_m,
@@ -113,18 +190,22 @@ impl MeshFolder<'_> {
                 "tracking": self.source.tracked_s,
                 "fit": self.source.fitted_s,
                 "density": seconds.density,
+                "visibility": seconds.visibility,
                 "fusion": seconds.fuse,
                 "signs": seconds.signs,
                 "surface": seconds.surface,
                 "components": seconds.components,
                 "topology": seconds.topology,
+                "simplification": simplified_s,
+                "skin": tied_s,
+                "texture": textured_s,
                 "all_after_tracking_and_fit": self.seconds,
             },
         })
     }
 
     fn print(&self) {
-        let (mesh, topology) = (&self.report.mesh, &self.report.mesh.topology);
+        let (mesh, topology) = (&self.report.mesh, &self.report.topology);
         println!(
             "{} triangles from {} Gaussians at voxels of {:.1} mm in {:.1} s; {:.1} % of the surface closes holes, {} self-intersections; {}",
             topology.triangles,

@@ -11,7 +11,7 @@ use crate::model::avatar::{Attachment, Avatar};
 /// Default texels along a side: about 2 mm each on an adult.
 pub const DEFAULT_ATLAS_SIDE: u32 = 1024;
 /// Range of texels along a side.
-const SIDES: std::ops::RangeInclusive<u32> = 16..=4096;
+pub(crate) const SIDES: std::ops::RangeInclusive<u32> = 16..=4096;
 /// Width of a Gaussian's kernel in the texture, in its own standard deviations: narrower than it is drawn, so that
 /// detail is preserved.
 pub(crate) const KERNEL: f32 = 0.6;
@@ -23,7 +23,7 @@ const LEAST_ALPHA: f32 = 0.05;
 /// Rings of texels around covered ones that repeat their colours, so that downsampled textures have no dark seams.
 const GUTTER: usize = 8;
 /// Colour of texels outside of the body, sRGB.
-const UNUSED: [u8; 3] = [128; 3];
+pub(crate) const UNUSED: [u8; 3] = [128; 3];
 
 /// Point of the body's surface that a texel shows.
 #[derive(Debug, Clone, Copy)]
@@ -196,7 +196,7 @@ fn composite(mut near: Vec<(f32, usize, f32)>, shown: &Shown, colors: &[Vec3]) -
 }
 
 /// Calls `visit(index, barycentric)` for the texels whose centres lie in a triangle.
-fn each_texel([a, b, c]: [Vec2; 3], side: u32, mut visit: impl FnMut(usize, [f32; 3])) {
+pub(crate) fn each_texel([a, b, c]: [Vec2; 3], side: u32, mut visit: impl FnMut(usize, [f32; 3])) {
     let area = (b - a).perp_dot(c - a);
     if area.abs() < 1e-12 || !area.is_finite() {
         return;
@@ -217,7 +217,7 @@ fn each_texel([a, b, c]: [Vec2; 3], side: u32, mut visit: impl FnMut(usize, [f32
 }
 
 /// Extends colours outwards, ring by ring.
-fn grow(image: &mut [Option<[u8; 3]>], side: usize) {
+pub(crate) fn grow(image: &mut [Option<[u8; 3]>], side: usize) {
     for _ in 0..GUTTER {
         let before = image.to_vec();
         for (i, color) in image.iter_mut().enumerate().filter(|(_, color)| color.is_none()) {
@@ -233,7 +233,7 @@ fn grow(image: &mut [Option<[u8; 3]>], side: usize) {
     }
 }
 
-fn encode(linear: Vec3) -> [u8; 3] {
+pub(crate) fn encode(linear: Vec3) -> [u8; 3] {
     linear.to_array().map(|value| (255.0 * srgb_from_linear(value) + 0.5) as u8)
 }
 

@@ -3,7 +3,6 @@ use flyrig_renderer::HarmonicOrder;
 use glam::DQuat;
 
 use super::*;
-use crate::Topology;
 
 /// Avatar of the built-in body as a rig makes it, with clothes that stand off by `clothes_m` to the front.
 fn avatar(clothes_m: f64) -> Avatar {
@@ -23,12 +22,17 @@ fn nearest(point: Vec3, others: &[Vec3]) -> f32 {
 #[test]
 fn the_mesh_is_closed_and_lies_on_the_surface_that_the_gaussians_draw() {
     let avatar = avatar(0.02);
-    let (person, report) = MeshedPerson::of_avatar(&avatar, &MeshOptions::default()).unwrap();
+    let (person, report) = MeshedPerson::of_avatar(
+        &avatar,
+        &PersonOptions { triangles: 30_000, texture_side: 256, ..PersonOptions::default() },
+    )
+    .unwrap();
     let mesh = &person.template;
     mesh.check().unwrap();
-    let found = TriMesh { positions: mesh.positions.clone(), triangles: mesh.triangles.clone(), from_hole: Vec::new() };
-    let topology = Topology::measure(&found);
+    let topology = report.topology;
     assert!(topology.is_closed_manifold() && topology.components == 1 && topology.volume_m3 > 0.04, "{topology:?}");
+    assert!(topology.triangles <= 30_000 && report.simplified_by_m < 1e-3, "{report:?}");
+    assert!(person.texture.covered > 256 * 256 / 4);
     let body = avatar.surface();
     let truth = sample_surface(&body, 40_000, 9).unwrap();
     let off: Vec<f32> = mesh.positions.iter().step_by(37).map(|p| nearest(*p, &truth.positions)).collect();
@@ -41,7 +45,11 @@ fn the_mesh_is_closed_and_lies_on_the_surface_that_the_gaussians_draw() {
 #[test]
 fn poses_and_nodes_move_the_mesh_as_they_move_the_body() {
     let avatar = avatar(0.0);
-    let (person, _) = MeshedPerson::of_avatar(&avatar, &MeshOptions::default()).unwrap();
+    let (person, _) = MeshedPerson::of_avatar(
+        &avatar,
+        &PersonOptions { triangles: 30_000, texture_side: 256, ..PersonOptions::default() },
+    )
+    .unwrap();
     let skeleton = &person.template.skeleton;
     let mut pose = skeleton.rest_pose();
     pose.root_translation = DVec3::new(0.4, 0.1, -0.2);
@@ -67,12 +75,21 @@ fn poisoned_gaussians_are_left_out() {
     for i in 0..3 {
         avatar.parameters.offset[1000 * i] = [f32::NAN, f32::INFINITY, 0.0, 0.0];
     }
-    let (_, report) = MeshedPerson::of_avatar(&avatar, &MeshOptions::default()).unwrap();
+    let (_, report) = MeshedPerson::of_avatar(
+        &avatar,
+        &PersonOptions { triangles: 30_000, texture_side: 256, ..PersonOptions::default() },
+    )
+    .unwrap();
     assert_eq!(report.mesh.dropped.not_finite, 3);
 
     let template = default_template(&ShapeParams::default()).unwrap();
     let few = sample_surface(&template, 10, 5).unwrap();
     let few = Avatar::new(&template, &few, None, &[], HarmonicOrder::Zero).unwrap();
-    let error = MeshedPerson::of_avatar(&few, &MeshOptions::default()).unwrap_err().to_string();
+    let error = MeshedPerson::of_avatar(
+        &few,
+        &PersonOptions { triangles: 30_000, texture_side: 256, ..PersonOptions::default() },
+    )
+    .unwrap_err()
+    .to_string();
     assert!(error.contains("10") && error.contains("1000"), "{error}");
 }

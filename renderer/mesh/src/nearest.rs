@@ -1,0 +1,139 @@
+//! Distance from points to a surface: a tree of boxes over its triangles.
+
+use glam::Vec3;
+
+use crate::TriMesh;
+
+/// Triangles of a leaf, at most.
+const LEAF: usize = 4;
+
+/// Triangles of a mesh, sorted into a tree of boxes.
+pub(crate) struct Surface {
+    triangles: Vec<[Vec3; 3]>,
+    nodes: Vec<Node>,
+}
+
+/// Box around a range of triangles. The first child of a node without triangles follows it.
+struct Node {
+    low: Vec3,
+    high: Vec3,
+    /// Range of triangles of a leaf; empty otherwise.
+    range: std::ops::Range<usize>,
+    /// Second child.
+    second: usize,
+}
+
+impl Surface {
+    /// Sorts the triangles of a mesh, whose indices must be in range.
+    pub(crate) fn new(mesh: &TriMesh) -> Self {
+        let corners = |t: &[u32; 3]| t.map(|i| mesh.positions[i as usize]);
+        let mut surface = Self { triangles: mesh.triangles.iter().map(corners).collect(), nodes: Vec::new() };
+        if !surface.triangles.is_empty() {
+            surface.split(0, surface.triangles.len());
+        }
+        surface
+    }
+
+    fn split(&mut self, from: usize, to: usize) {
+        let part = &mut self.triangles[from..to];
+        let points = part.as_flattened();
+        let low = points.iter().copied().fold(Vec3::INFINITY, Vec3::min);
+        let high = points.iter().copied().fold(Vec3::NEG_INFINITY, Vec3::max);
+        let node = self.nodes.len();
+        self.nodes.push(Node { low, high, range: from..to, second: 0 });
+        if part.len() <= LEAF {
+            return;
+        }
+        let axis = (high - low).max_position();
+        let center = |t: &[Vec3; 3]| t[0][axis] + t[1][axis] + t[2][axis];
+        let half = part.len() / 2;
+        part.select_nth_unstable_by(half, |a, b| center(a).total_cmp(&center(b)));
+        self.split(from, from + half);
+        self.nodes[node].second = self.nodes.len();
+        self.nodes[node].range = 0..0;
+        self.split(from + half, to);
+    }
+
+    /// Returns the distance from a point to the nearest triangle, metres; infinity without triangles.
+    pub(crate) fn distance_m(&self, point: Vec3) -> f32 {
+        let to_box = |node: usize| {
+            self.nodes.get(node).map_or(f32::INFINITY, |n| point.distance_squared(point.clamp(n.low, n.high)))
+        };
+        let mut best = f32::INFINITY;
+        let mut open = vec![(to_box(0), 0)];
+        while let Some((squared, i)) = open.pop() {
+            if squared >= best {
+                continue;
+            }
+            let node = &self.nodes[i];
+            for triangle in &self.triangles[node.range.clone()] {
+                best = best.min(point.distance_squared(nearest_on(triangle, point)));
+            }
+            if node.range.is_empty() {
+                let mut children = [i + 1, node.second].map(|child| (to_box(child), child));
+                if children[0].0 < children[1].0 {
+                    children.reverse();
+                }
+                open.extend(children);
+            }
+        }
+        best.sqrt()
+    }
+}
+
+/// Returns the point of a triangle nearest to `p` (Ericson, Real-Time Collision Detection, section 5.1.5).
+fn nearest_on(&[a, b, c]: &[Vec3; 3], p: Vec3) -> Vec3 {
+    let (ab, ac) = (b - a, c - a);
+    let (d1, d2) = (ab.dot(p - a), ac.dot(p - a));
+    if d1 <= 0.0 && d2 <= 0.0 {
+        return a;
+    }
+    let (d3, d4) = (ab.dot(p - b), ac.dot(p - b));
+    if d3 >= 0.0 && d4 <= d3 {
+        return b;
+    }
+    let (d5, d6) = (ab.dot(p - c), ac.dot(p - c));
+    if d6 >= 0.0 && d5 <= d6 {
+        return c;
+    }
+    let (va, vb, vc) = (d3 * d6 - d5 * d4, d5 * d2 - d1 * d6, d1 * d4 - d3 * d2);
+    if vc <= 0.0 && d1 >= 0.0 && d3 <= 0.0 {
+        return a + ab * (d1 / (d1 - d3));
+    }
+    if vb <= 0.0 && d2 >= 0.0 && d6 <= 0.0 {
+        return a + ac * (d2 / (d2 - d6));
+    }
+    if va <= 0.0 && d4 >= d3 && d5 >= d6 {
+        return b + (c - b) * ((d4 - d3) / ((d4 - d3) + (d5 - d6)));
+    }
+    let sum = va + vb + vc;
+    a + ab * (vb / sum) + ac * (vc / sum)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::shapes;
+
+    /// Compares with a dense sampling of every triangle.
+    #[test]
+    fn distances_are_those_of_a_search_through_all_points() {
+        let mesh = shapes::two_tori(24, 8);
+        let surface = Surface::new(&mesh);
+        for i in 0..40 {
+            let angle = i as f32;
+            let point = Vec3::new(angle.sin(), 0.7 * (1.7 * angle).sin(), (2.3 * angle).cos());
+            let mut expected = f32::INFINITY;
+            for triangle in &mesh.triangles {
+                let [a, b, c] = triangle.map(|i| mesh.positions[i as usize]);
+                for (u, v) in (0..=20).flat_map(|u| (0..=20 - u).map(move |v| (u as f32 / 20.0, v as f32 / 20.0))) {
+                    expected = expected.min(point.distance(a + u * (b - a) + v * (c - a)));
+                }
+            }
+            let found = surface.distance_m(point);
+            assert!(found <= expected + 1e-6 && found > expected - 0.006, "{found} {expected}");
+        }
+        assert!(surface.distance_m(mesh.positions[5]) < 1e-6);
+        assert!(Surface::new(&TriMesh::default()).distance_m(Vec3::ZERO).is_infinite());
+    }
+}

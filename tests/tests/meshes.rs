@@ -1,0 +1,90 @@
+//! Meshes: a take, or an avatar, becomes a closed mesh with bones, in files that other programs read; unsupported input has a named error and
+//! leaves nothing behind.
+#![allow(clippy::unwrap_used, clippy::panic)] // a test may fail by panicking, in its helpers too
+
+use std::{fs, path::Path};
+
+use flyrig_body::{load_gltf, skin_mesh};
+use flyrig_tests::{run, write_dataset};
+
+const PROGRAM: &str = env!("CARGO_BIN_EXE_flyrig-under-test");
+const GIVEN: [&str; 4] = ["--pose", "given", "--masks", "given"];
+const SMALL: [&str; 6] = ["--triangles", "4000", "--texture", "64", "--voxel", "20"];
+
+fn number(metrics: &serde_json::Value, name: &str) -> f64 {
+    metrics[name].as_f64().unwrap_or_else(|| panic!("no {name} in {metrics}"))
+}
+
+#[test]
+fn a_take_becomes_a_closed_mesh_that_moves_as_the_person_does() {
+    let data = write_dataset().unwrap();
+    let folder = tempfile::tempdir().unwrap();
+    let take = data.root.to_string_lossy().into_owned();
+    let mesh = |args: &[&str]| run(PROGRAM, &[&["mesh"], args, &SMALL].concat(), folder.path()).unwrap();
+    let of_take = |out: &str, more: &[&str]| {
+        let args =
+            [&take, "--inputs", "00,02,04", "--frames", "0..4", "--gaussians", "4000", "--steps", "5", "--out", out];
+        mesh(&[&args[..], &GIVEN, more].concat())
+    };
+    let made = of_take("m", &["--sequence"]);
+    assert_eq!(made.code, Some(0), "{made:?}");
+    let at = |name: &str| folder.path().join("m").join(name);
+    let metrics: serde_json::Value = serde_json::from_slice(&fs::read(at("metrics.json")).unwrap()).unwrap();
+    assert_eq!((&metrics["closed_manifold"], &metrics["components"]), (&true.into(), &1.into()), "{metrics}");
+    assert!(number(&metrics, "triangles") <= 4000.0 && number(&metrics, "volume_m3") > 0.03, "{metrics}");
+
+    // Skin and motion bring the mesh to where its surface was written.
+    let human = load_gltf(&at("mesh.glb")).unwrap();
+    let track = human.track.unwrap();
+    assert_eq!(track.keys().len(), 4);
+    let (posed, _) = skin_mesh(&human.template, &track.at(track.keys()[0].0));
+    let height = |y: &dyn Fn(usize) -> f32, count: usize| {
+        (0..count).map(y).fold(f32::NEG_INFINITY, f32::max) - (0..count).map(y).fold(f32::INFINITY, f32::min)
+    };
+    let tall = height(&|i| posed[i].y, posed.len());
+    assert!((1.2..2.2).contains(&tall), "{tall} m, y up");
+    let surfaces: Vec<_> = fs::read_dir(at("surface")).unwrap().collect();
+    assert_eq!(surfaces.len(), 4);
+    for name in ["mesh.obj", "mesh.mtl", "mesh.png", "mesh.usdz", "mesh.3mf", "sequence.usda"] {
+        assert!(fs::metadata(at(name)).unwrap().len() > 60, "{name}");
+    }
+    // The same take gives the same mesh.
+    assert_eq!(of_take("again", &[]).code, Some(0));
+    let bytes = |folder: &Path| fs::read(folder.join("mesh.glb")).unwrap();
+    assert!(bytes(&folder.path().join("m")) == bytes(&folder.path().join("again")), "reruns differ");
+
+    // From an avatar, in the rest pose and without a motion.
+    let build = ["avatar", "build", &take, "--inputs", "00,02,04", "--frames", "0..4", "--gaussians", "4000"];
+    let built = run(PROGRAM, &[&build[..], &["--steps", "5", "--out", "a.flyavatar"], &GIVEN].concat(), folder.path());
+    assert_eq!(built.unwrap().code, Some(0));
+    let from_avatar = mesh(&["a.flyavatar", "--out", "avatar"]);
+    assert_eq!(from_avatar.code, Some(0), "{from_avatar:?}");
+    assert!(load_gltf(&folder.path().join("avatar/mesh.glb")).unwrap().track.is_none());
+
+    let refused = |args: &[&str], text: &str| {
+        let before = fs::read_dir(folder.path()).unwrap().count();
+        let failed = mesh(args);
+        assert_eq!(failed.code, Some(1), "{failed:?}");
+        assert!(failed.stderr.contains(text), "{}", failed.stderr);
+        assert_eq!(fs::read_dir(folder.path()).unwrap().count(), before, "{args:?} left a file");
+    };
+    refused(&["a.flyavatar", "--out", "m"], "m exists already");
+    refused(&["a.flyavatar", "--out", "none/m"], "the folder none does not exist");
+    refused(&["a.flyavatar", "--out", "x", "--inputs", "00"], "is an avatar and not a take");
+    refused(&["missing.flyavatar", "--out", "x"], "missing.flyavatar does not exist");
+    fs::write(folder.path().join("broken.flyavatar"), b"nothing").unwrap();
+    refused(&["broken.flyavatar", "--out", "x"], "broken.flyavatar");
+}
+
+#[test]
+fn absurd_sizes_are_refused() {
+    let folder = tempfile::tempdir().unwrap();
+    for (option, value) in
+        [("--voxel", "0"), ("--voxel", "nan"), ("--texture", "9"), ("--triangles", "1"), ("--gaussians", "3")]
+    {
+        let failed = run(PROGRAM, &["mesh", "a.flyavatar", "--out", "m", option, value], folder.path()).unwrap();
+        assert_eq!(failed.code, Some(2), "{option} {value}: {failed:?}");
+        assert!(failed.stderr.contains(option), "{}", failed.stderr);
+    }
+    assert_eq!(fs::read_dir(folder.path()).unwrap().count(), 0);
+}
