@@ -79,6 +79,16 @@ pub struct RenderTarget {
     pub depth: StorageBuffer<f32>,
     /// Canonical position times alpha, metres; w: alpha.
     pub canonical: StorageBuffer<[f32; 4]>,
+    /// Surface of anisotropic Gaussians, `None` until [`Self::with_planes`]; alpha is that of [`Self::color`], and
+    /// [`PixelPlane`](crate::PixelPlane) divides by it. Each Gaussian counts as the plane through its centre perpendicular
+    /// to the axis of its smallest scale (the first of equal ones).
+    ///
+    /// - xyz: sum of blending weight times unit normal, in camera axes, towards the camera.
+    /// - w: sum of blending weight times the camera-space z where the pixel's ray meets the plane, metres. Rays are
+    ///   linearised at the Gaussian's centre, as the projection of its ellipse is: exact for lenses without distortion.
+    ///   The depth stays within three standard deviations of the Gaussian along z, and within 0.9 of its depth, about
+    ///   the depth of its centre. No point of the plane within three standard deviations of the centre is beyond.
+    pub planes: Option<StorageBuffer<[f32; 4]>>,
 }
 
 impl RenderTarget {
@@ -100,6 +110,15 @@ impl RenderTarget {
         Self::with_room(gpu, [width, height], 0)
     }
 
+    /// Adds the image of normals and plane depths, all zero.
+    ///
+    /// # Errors
+    /// [`GpuError::TooLarge`].
+    pub fn with_planes(self, gpu: &GpuContext) -> Result<Self, GpuError> {
+        let planes = StorageBuffer::zeroed(gpu, "rendered planes", self.color.len())?;
+        Ok(Self { planes: Some(planes), ..self })
+    }
+
     /// Returns the number of pixels of the largest target that the adapter can bind.
     #[must_use]
     pub fn max_pixels(gpu: &GpuContext) -> u64 {
@@ -115,6 +134,7 @@ impl RenderTarget {
             color: StorageBuffer::zeroed(gpu, "rendered colour", pixels)?,
             depth: StorageBuffer::zeroed(gpu, "rendered depth", others)?,
             canonical: StorageBuffer::zeroed(gpu, "rendered canonical positions", others)?,
+            planes: None,
         })
     }
 }

@@ -22,6 +22,7 @@ mod color_match;
 mod constants;
 mod files;
 mod image_loss;
+mod pixel_plane;
 mod raster;
 mod schema;
 mod sort;
@@ -50,6 +51,7 @@ pub use files::anisotropic_ply::{PlyError, parse_anisotropic_ply, write_anisotro
 pub use files::ply::{ExportError, SH_DEGREE_0};
 pub use image_loss::loss::{ImageLoss, ImageSums, WantedImage};
 pub use image_loss::settings::{LossSettings, UNKNOWN_RGBA};
+pub use pixel_plane::PixelPlane;
 pub use raster::kernels::{AWAY_COSINE, BACKFACING_COSINE};
 pub use raster::rasterizer::Rasterizer;
 pub use raster::settings::{Outputs, RasterSettings, RasterStats};

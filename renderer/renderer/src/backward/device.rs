@@ -7,7 +7,7 @@ use wgpu::{CommandEncoder, ComputePass, ComputePassDescriptor};
 
 use crate::anisotropic::order::HarmonicOrder;
 use crate::backward::gradients::{Carry, ImageGradients};
-use crate::backward::kernels;
+use crate::backward::kernels::{self, Depths};
 use crate::backward::target::GradientTarget;
 use crate::buffers::RenderTarget;
 use crate::raster::buffers::ImageBuffers;
@@ -15,7 +15,7 @@ use crate::raster::device::{DeviceRasterizer, FRAME};
 use crate::raster::kernels::Tile;
 use crate::raster::settings::Latest;
 use crate::sort::radix::Keys;
-use crate::sort::scan::run;
+use crate::sort::scan::{run, run_at};
 
 /// [`BackwardRasterizer`](crate::BackwardRasterizer) on the device.
 #[derive(Debug)]
@@ -27,14 +27,21 @@ pub(crate) struct DeviceBackward {
     project: [ComputeKernel; 2],
     /// Compiled on first use.
     anisotropic: OnceLock<AnisotropicKernels>,
+    /// Compiled on first use.
+    planes: OnceLock<PlaneKernels>,
     places: StorageBuffer<[u32; 4]>,
     tile_limits: StorageBuffer<u32>,
-    pair_sums: StorageBuffer<[[f32; 4]; 3]>,
-    /// Number of elements of `pair_sums`, in x; reallocated with it.
+    /// Three or five elements per pair, [`kernels::vectors`].
+    pair_sums: StorageBuffer<[f32; 4]>,
+    /// Number of pairs that `pair_sums` has room for, in x; reallocated with it.
     room: StorageBuffer<[u32; 4]>,
-    /// Sums per Gaussian.
-    sums: StorageBuffer<[[f32; 4]; 3]>,
+    pairs: usize,
+    /// Sums per Gaussian, as many elements as per pair.
+    sums: StorageBuffer<[f32; 4]>,
 }
+
+/// Depths by index of the kernels for images without derivatives by planes.
+const CENTER_DEPTHS: [Depths; 2] = [Depths::None, Depths::Centers];
 
 #[derive(Debug)]
 struct AnisotropicKernels {
@@ -48,9 +55,31 @@ impl AnisotropicKernels {
     fn new(gpu: &GpuContext) -> Self {
         let tile = Tile::for_adapter(gpu);
         Self {
-            blend: [false, true].map(|depth| kernel(gpu, "blend_backward", &kernels::blend_wgsl(tile, depth, true))),
-            project: kernel(gpu, "project_backward", &kernels::project_anisotropic_wgsl()),
-            paint: HarmonicOrder::ALL.map(|order| kernel(gpu, "paint_backward", &kernels::paint_wgsl(order))),
+            blend: CENTER_DEPTHS.map(|depths| kernel(gpu, "blend_backward", &kernels::blend_wgsl(tile, depths, true))),
+            project: kernel(gpu, "project_backward", &kernels::project_anisotropic_wgsl(false)),
+            paint: HarmonicOrder::ALL.map(|order| kernel(gpu, "paint_backward", &kernels::paint_wgsl(order, false))),
+        }
+    }
+}
+
+/// Kernels for images with derivatives by planes.
+#[derive(Debug)]
+struct PlaneKernels {
+    blend: ComputeKernel,
+    sum: ComputeKernel,
+    project: ComputeKernel,
+    /// One kernel per harmonic order.
+    paint: [ComputeKernel; 3],
+}
+
+impl PlaneKernels {
+    fn new(gpu: &GpuContext) -> Self {
+        let blend = kernels::blend_wgsl(Tile::for_adapter(gpu), Depths::Planes, true);
+        Self {
+            blend: kernel(gpu, "blend_backward", &blend),
+            sum: kernel(gpu, "sum_tiles", &kernels::sums_wgsl(true)),
+            project: kernel(gpu, "project_backward", &kernels::project_anisotropic_wgsl(true)),
+            paint: HarmonicOrder::ALL.map(|order| kernel(gpu, "paint_backward", &kernels::paint_wgsl(order, true))),
         }
     }
 }
@@ -67,6 +96,8 @@ struct View<'a> {
     latest: Latest,
     target: &'a RenderTarget,
     incoming: &'a ImageGradients,
+    /// Drawn planes and dL/d planes, where the derivatives are by planes as well.
+    planes: Option<[&'a StorageBuffer<[f32; 4]>; 2]>,
 }
 
 impl DeviceBackward {
@@ -74,14 +105,16 @@ impl DeviceBackward {
         let tile = Tile::for_adapter(gpu);
         Ok(Self {
             place: kernel(gpu, "place_gaussians", &kernels::places_wgsl()),
-            blend: [false, true].map(|depth| kernel(gpu, "blend_backward", &kernels::blend_wgsl(tile, depth, false))),
-            sum: kernel(gpu, "sum_tiles", &kernels::sums_wgsl()),
+            blend: CENTER_DEPTHS.map(|depths| kernel(gpu, "blend_backward", &kernels::blend_wgsl(tile, depths, false))),
+            sum: kernel(gpu, "sum_tiles", &kernels::sums_wgsl(false)),
             project: [false, true].map(|lift| kernel(gpu, "project_backward", &kernels::project_wgsl(lift))),
             anisotropic: OnceLock::new(),
+            planes: OnceLock::new(),
             places: StorageBuffer::zeroed(gpu, "places of sums", 0)?,
             tile_limits: StorageBuffer::zeroed(gpu, "walked tiles", 0)?,
             pair_sums: StorageBuffer::zeroed(gpu, "sums of pairs", 0)?,
             room: StorageBuffer::zeroed(gpu, "room for sums of pairs", 1)?,
+            pairs: 0,
             sums: StorageBuffer::zeroed(gpu, "sums of Gaussians", 0)?,
         })
     }
@@ -98,12 +131,16 @@ impl DeviceBackward {
         let (Some(picture), Some(latest)) = (&rasterizer.picture, rasterizer.latest) else { return Ok(()) };
         let layout = picture.layout();
         let tiles = layout.tiles[0] as usize * layout.tiles[1] as usize;
-        self.grow(gpu, &latest, tiles, layout.pair_capacity)?;
+        let planes = match (&target.planes, &incoming.planes) {
+            (Some(drawn), Some(incoming)) if latest.outputs.planes => Some([drawn, incoming]),
+            _ => None,
+        };
+        self.grow(gpu, &latest, tiles, (layout.pair_capacity, kernels::vectors(planes.is_some())))?;
 
         encoder.clear_buffer(self.places.raw(), 0, None);
         // Tiles that are not blended have walked nothing.
         encoder.clear_buffer(self.tile_limits.raw(), 0, None);
-        let view = View { gpu, rasterizer, picture, latest, target, incoming };
+        let view = View { gpu, rasterizer, picture, latest, target, incoming, planes };
         let mut pass =
             encoder.begin_compute_pass(&ComputePassDescriptor { label: Some("backward"), ..Default::default() });
         self.place(&view, &mut pass);
@@ -146,6 +183,13 @@ impl DeviceBackward {
             self.pair_sums.raw().as_entire_binding(),
             self.tile_limits.raw().as_entire_binding(),
         ];
+        if let Some([drawn, incoming]) = view.planes {
+            let planes = [&view.rasterizer.planes.raw(), &drawn.raw(), &incoming.raw()].map(|b| b.as_entire_binding());
+            let numbered = (0..).zip(resources).filter(|(binding, _)| ![7, 9].contains(binding));
+            let resources: Vec<_> = numbered.chain((12..).zip(planes)).collect();
+            let kernel = &self.planes(view.gpu).blend;
+            return run_at(view.gpu, pass, kernel, &resources, <(u32, u32)>::from(view.latest.blended));
+        }
         let kernel = &kernels[usize::from(view.latest.outputs.depth)];
         run(view.gpu, pass, kernel, &resources, <(u32, u32)>::from(view.latest.blended));
     }
@@ -158,7 +202,8 @@ impl DeviceBackward {
             self.pair_sums.raw().as_entire_binding(),
             self.sums.raw().as_entire_binding(),
         ];
-        run(view.gpu, pass, &self.sum, &resources, view.by_gaussian());
+        let kernel = if view.planes.is_some() { &self.planes(view.gpu).sum } else { &self.sum };
+        run(view.gpu, pass, kernel, &resources, view.by_gaussian());
     }
 
     fn project(&self, view: &View<'_>, pass: &mut ComputePass<'_>, to: GradientTarget<'_>) {
@@ -172,7 +217,13 @@ impl DeviceBackward {
                 run(gpu, pass, kernel, &[frame, sums, center_scale, center, carried], groups);
             }
             GradientTarget::Anisotropic { gaussians, out } => {
-                let kernels = self.anisotropic(gpu);
+                let (project, paint) = if view.planes.is_some() {
+                    let kernels = self.planes(gpu);
+                    (&kernels.project, &kernels.paint)
+                } else {
+                    let kernels = self.anisotropic(gpu);
+                    (&kernels.project, &kernels.paint)
+                };
                 let [center, scale, rotation, harmonics] =
                     gaussians.attributes().map(|buffer| buffer.raw().as_entire_binding());
                 let [center_out, scale_out, rotation_out, harmonics_out] =
@@ -180,8 +231,8 @@ impl DeviceBackward {
                 let inputs = [frame.clone(), sums.clone(), center.clone(), scale, rotation];
                 let resources: Vec<_> =
                     inputs.into_iter().chain([center_out.clone(), scale_out, rotation_out]).collect();
-                run(gpu, pass, &kernels.project, &resources, groups);
-                let kernel = &kernels.paint[gaussians.order() as usize];
+                run(gpu, pass, project, &resources, groups);
+                let kernel = &paint[gaussians.order() as usize];
                 let resources = [frame, center, harmonics, sums, center_out, harmonics_out];
                 run(gpu, pass, kernel, &resources, groups);
             }
@@ -192,20 +243,34 @@ impl DeviceBackward {
         self.anisotropic.get_or_init(|| AnisotropicKernels::new(gpu))
     }
 
-    fn grow(&mut self, gpu: &GpuContext, latest: &Latest, tiles: usize, pairs: u32) -> Result<(), GpuError> {
+    fn planes(&self, gpu: &GpuContext) -> &PlaneKernels {
+        self.planes.get_or_init(|| PlaneKernels::new(gpu))
+    }
+
+    fn grow(
+        &mut self,
+        gpu: &GpuContext,
+        latest: &Latest,
+        tiles: usize,
+        (pairs, vectors): (u32, usize),
+    ) -> Result<(), GpuError> {
         if self.places.len() < latest.gaussians {
             self.places = StorageBuffer::zeroed(gpu, "places of sums", latest.gaussians)?;
-            self.sums = StorageBuffer::zeroed(gpu, "sums of Gaussians", latest.gaussians)?;
+        }
+        if self.sums.len() < vectors * latest.gaussians {
+            self.sums = StorageBuffer::zeroed(gpu, "sums of Gaussians", vectors * latest.gaussians)?;
         }
         if self.tile_limits.len() < tiles {
             self.tile_limits = StorageBuffer::zeroed(gpu, "walked tiles", tiles)?;
         }
         let limits = gpu.device.limits();
-        let most = limits.max_buffer_size.min(limits.max_storage_buffer_binding_size) / kernels::PAIR_SUM_BYTES;
+        let most = limits.max_buffer_size.min(limits.max_storage_buffer_binding_size)
+            / (vectors as u64 * kernels::VECTOR_BYTES);
         let wanted = u64::from(pairs).min(most) as usize;
-        if self.pair_sums.len() < wanted {
-            self.pair_sums = StorageBuffer::zeroed(gpu, "sums of pairs", wanted)?;
+        if self.pairs < wanted || self.pair_sums.len() < vectors * wanted {
+            self.pair_sums = StorageBuffer::zeroed(gpu, "sums of pairs", vectors * wanted)?;
             self.room = StorageBuffer::from_slice(gpu, "room for sums of pairs", &[[wanted as u32, 0, 0, 0]])?;
+            self.pairs = wanted;
         }
         Ok(())
     }

@@ -11,9 +11,12 @@ struct Place {
 
 // Sums over the pixels of one tile for one Gaussian. With e the exponent log2(alpha), s = dL/de of a pixel, (x, y) the
 // pixel from the splat's centre and w its blending weight:
-// [s, s x, s y, w dL/d(depth sum)], [s x x, s x y, s y y, w], [w carried, 0].
+// [s, s x, s y, w dL/d(depth sum)], [s x x, s x y, s y y, w], [w carried, 0]; and, where the image has planes (VECTORS = 5), with t
+// the ratio of the centre's depth to the plane's: [w dL/d(normal sum), w dL/d(plane depth sum) / t],
+// [dL/dt, dL/dt x, dL/dt y where t is not limited, dL/d reach where it is].
+// Prefix: const VECTORS.
 struct PairSum {
-    vectors: array<vec4<f32>, 3>,
+    vectors: array<vec4<f32>, VECTORS>,
 }
 
 fn place_width(place: Place) -> u32 {

@@ -12,6 +12,10 @@ pub struct ImageGradients {
     /// x: dL/d [`crate::RenderTarget::depth`], per metre (ignored where the forward pass wrote no depth); yzw: three
     /// numbers that the pixel passes to its Gaussians, see [`Carry`].
     pub depth_carry: StorageBuffer<[f32; 4]>,
+    /// dL/d [`crate::RenderTarget::planes`]: normal sums, depth sum (per metre). `None`, until [`Self::with_planes`], and
+    /// an image that was drawn without planes contribute nothing. Where they count, the x of [`Self::depth_carry`] does
+    /// not: a view has derivatives by the depth of the planes or by that of the centres.
+    pub planes: Option<StorageBuffer<[f32; 4]>>,
 }
 
 impl ImageGradients {
@@ -24,7 +28,17 @@ impl ImageGradients {
         Ok(Self {
             color: StorageBuffer::zeroed(gpu, "dL/d colour", pixels)?,
             depth_carry: StorageBuffer::zeroed(gpu, "dL/d depth", pixels)?,
+            planes: None,
         })
+    }
+
+    /// Adds derivatives with respect to normals and plane depths, all zero.
+    ///
+    /// # Errors
+    /// [`GpuError::TooLarge`].
+    pub fn with_planes(self, gpu: &GpuContext) -> Result<Self, GpuError> {
+        let planes = StorageBuffer::zeroed(gpu, "dL/d planes", self.color.len())?;
+        Ok(Self { planes: Some(planes), ..self })
     }
 }
 

@@ -1,26 +1,26 @@
-//! Backward rasteriser on the processor: `backward/blend.wgsl` and the sums per Gaussian.
+//! Backward rasteriser on the processor: the sums per Gaussian.
 
-#![allow(clippy::needless_range_loop)] // one index for several lanes is what compilers turn into vectors
-
+mod blend;
+mod planes;
 mod project;
 
-use glam::{Vec3, Vec4};
+use flyrig_gpu::StorageBuffer;
+use glam::Vec3;
 use rayon::prelude::*;
 
 use crate::anisotropic::buffers::{AnisotropicBuffers, AnisotropicGradients};
 use crate::anisotropic::harmonics::Harmonics;
 use crate::backward::gradients::{Carry, GaussianGradients, ImageGradients};
+use crate::backward::processor::blend::{PLANE_INPUTS, Pixels, ROWS, TileBackward};
+use crate::backward::processor::planes::{PlaneSum, add_plane};
 use crate::backward::processor::project::{PairSum, add_anisotropic, add_isotropic};
 use crate::backward::target::GradientTarget;
 use crate::buffers::{GaussianBuffers, RenderTarget};
-use crate::raster::kernels::{MAX_ALPHA, OPAQUE};
-use crate::raster::processor::blend::{LOG2_CUT, TileLanes, exponents, is_opaque, rows_of};
-use crate::raster::processor::lanes::{LANES, Lanes, exp2, sums as sums_of_lanes};
-use crate::raster::processor::project::{ProjectedSplat, TILE};
+use crate::raster::processor::lanes::LANES;
+use crate::raster::processor::lists::Lists;
 use crate::raster::processor::rasterizer::{ProcessorRasterizer, RasterImage};
 use crate::raster::processor::shape::Shape;
 
-const ROWS: usize = TILE as usize;
 /// Index of the sum of weights in [`PairSum`].
 const WEIGHT: usize = 7;
 /// Gaussians per task of the projection's derivative.
@@ -33,8 +33,12 @@ pub(crate) struct ProcessorBackward {
     pair_sums: Vec<PairSum>,
     /// Number of pairs walked per tile.
     walked: Vec<u32>,
+    /// Sum of the plane per list entry; valid for blended tiles of an image with planes.
+    plane_pair_sums: Vec<PlaneSum>,
     /// Sum per Gaussian.
     sums: Vec<PairSum>,
+    /// Sum of the plane per Gaussian; empty for an image without planes.
+    plane_sums: Vec<PlaneSum>,
     is_touched: Vec<bool>,
 }
 
@@ -73,62 +77,90 @@ impl ProcessorBackward {
         let ProcessorRasterizer { lists, latest: Some(rendered), .. } = rasterizer else { return None };
         let (drawn_color, drawn_depth) = (target.color.slice()?, target.depth.slice()?);
         let (d_color, d_depth) = (incoming.color.slice()?, incoming.depth_carry.slice()?);
+        let outputs = rendered.settings.outputs;
+        let with_planes = outputs.planes && carries_color;
+        let images = [&target.planes, &incoming.planes].map(|image| image.as_ref().and_then(StorageBuffer::slice));
+        let planes = match &images {
+            [Some(drawn), Some(incoming)] if with_planes => Some([&drawn[..], &incoming[..]]),
+            _ => None,
+        };
+        let with_planes = planes.is_some();
         let pixels = Pixels {
             size: rendered.size.map(|side| side as usize),
             color: &drawn_color,
-            depth: rendered.settings.outputs.depth.then_some(&drawn_depth),
+            depth: (outputs.depth && !with_planes).then_some(&drawn_depth),
             d_color: &d_color,
             d_depth: &d_depth,
+            planes,
             carries_color,
         };
         self.pair_sums.resize(lists.pairs.len(), [0.0; 11]);
+        self.plane_pair_sums.resize(if with_planes { lists.pairs.len() } else { 0 }, [0.0; 8]);
         self.walked.clear();
         self.walked.resize(lists.starts.len().saturating_sub(1), 0);
         // The part of the sums that belongs to each row of tiles.
         let mut rest = self.pair_sums.as_mut_slice();
+        let mut plane_rest = self.plane_pair_sums.as_mut_slice();
         let columns = lists.tiles[0] as usize;
         let mut bands = Vec::with_capacity(lists.tiles[1] as usize);
         for (row, walked) in self.walked.chunks_mut(columns.max(1)).enumerate() {
             let first = lists.starts[row * columns];
-            let (part, others) = rest.split_at_mut((lists.starts[(row + 1) * columns] - first) as usize);
-            bands.push((row, first as usize, part, walked));
-            rest = others;
+            let length = (lists.starts[(row + 1) * columns] - first) as usize;
+            let (part, others) = rest.split_at_mut(length);
+            let (plane_part, plane_others) = plane_rest.split_at_mut(length.min(plane_rest.len()));
+            bands.push((row, first as usize, (part, plane_part), walked));
+            (rest, plane_rest) = (others, plane_others);
         }
         let within = |first: u32, count: u32, at: usize| (first as usize..(first + count) as usize).contains(&at);
         bands.into_par_iter().filter(|(row, ..)| within(rendered.first_tile[1], rendered.blended[1], *row)).for_each(
-            |(row, first, part, walked)| {
+            |(row, first, (part, plane_part), walked)| {
                 for (column, walked) in walked.iter_mut().enumerate() {
                     if !within(rendered.first_tile[0], rendered.blended[0], column) {
                         continue;
                     }
-                    let Some(state) = pixels.state(column, row) else { continue };
                     let range = lists.range(row * columns + column);
-                    let (origin, list) = ([(column * LANES) as f32, (row * ROWS) as f32], &lists.pairs[range.clone()]);
-                    let (splats, out) = (&lists.splats[..], &mut part[range.start - first..range.end - first]);
-                    *walked = if pixels.only_colors() {
-                        flyrig_types::vectorized(TileBackward::<true> { state, origin, list, splats, color, out })
-                    } else {
-                        flyrig_types::vectorized(TileBackward::<false> { state, origin, list, splats, color, out })
+                    let (at, list) = ((column, row), &lists.pairs[range.clone()]);
+                    let range = range.start - first..range.end - first;
+                    let plane_out = if with_planes { &mut plane_part[range.clone()] } else { &mut [] };
+                    let out = (&mut part[range], plane_out);
+                    *walked = match (pixels.only_colors(), with_planes) {
+                        (true, true) => walk::<true, PLANE_INPUTS>(&pixels, at, (list, lists, color), out),
+                        (true, false) => walk::<true, 0>(&pixels, at, (list, lists, color), out),
+                        (false, _) => walk::<false, 0>(&pixels, at, (list, lists, color), out),
                     };
                 }
             },
         );
+        self.add_up(lists, rendered.gaussians);
+        Some(())
+    }
+
+    /// Adds the sums of the list entries to those of their Gaussians, tile by tile.
+    fn add_up(&mut self, lists: &Lists, gaussians: usize) {
         self.sums.clear();
-        self.sums.resize(rendered.gaussians, [0.0; 11]);
+        self.sums.resize(gaussians, [0.0; 11]);
+        self.plane_sums.clear();
+        self.plane_sums.resize(if self.plane_pair_sums.is_empty() { 0 } else { gaussians }, [0.0; 8]);
         self.is_touched.clear();
-        self.is_touched.resize(rendered.gaussians, false);
+        self.is_touched.resize(gaussians, false);
         for (tile, &walked) in self.walked.iter().enumerate().filter(|(_, walked)| **walked > 0) {
             let range = lists.range(tile);
             let range = range.start..range.start + walked as usize;
-            let pairs = lists.pairs[range.clone()].iter().zip(&self.pair_sums[range]);
+            let pairs = lists.pairs[range.clone()].iter().zip(&self.pair_sums[range.clone()]);
             // Without weight in any pixel all sums are 0.
             for (&gaussian, more) in pairs.filter(|(_, sums)| sums[WEIGHT] != 0.0) {
                 let (sums, is_touched) = (&mut self.sums[gaussian as usize], &mut self.is_touched[gaussian as usize]);
                 sums.iter_mut().zip(more).for_each(|(sum, more)| *sum += more);
                 *is_touched = true;
             }
+            if !self.plane_sums.is_empty() {
+                let pairs = lists.pairs[range.clone()].iter().zip(&self.plane_pair_sums[range]);
+                for (&gaussian, more) in pairs {
+                    let sums = &mut self.plane_sums[gaussian as usize];
+                    sums.iter_mut().zip(more).for_each(|(sum, more)| *sum += more);
+                }
+            }
         }
-        Some(())
     }
 
     /// Carries the sums to isotropic Gaussians.
@@ -157,9 +189,9 @@ impl ProcessorBackward {
 
     /// Carries the sums to anisotropic Gaussians.
     fn add_anisotropic(&self, rendered: &RasterImage, gaussians: &AnisotropicBuffers, out: &AnisotropicGradients) {
-        let slices = gaussians.attributes().map(flyrig_gpu::StorageBuffer::slice);
+        let slices = gaussians.attributes().map(StorageBuffer::slice);
         let [Some(center), Some(scale_opacity), Some(rotation), Some(harmonics)] = &slices else { return };
-        let slices = out.attributes().map(flyrig_gpu::StorageBuffer::slice_mut);
+        let slices = out.attributes().map(StorageBuffer::slice_mut);
         let [Some(mut center_out), Some(mut scale_out), Some(mut rotation_out), Some(mut harmonics_out)] = slices
         else {
             return;
@@ -176,6 +208,7 @@ impl ProcessorBackward {
                     rendered,
                     first: chunk * CHUNK,
                     ins,
+                    plane_sums: &self.plane_sums,
                     scale_opacity: &scale_opacity[..],
                     rotation: &rotation[..],
                     colors,
@@ -187,12 +220,29 @@ impl ProcessorBackward {
     }
 }
 
+/// Walks over the list of the tile at a column and row of tiles and writes the sum of each pair. Returns the number of pairs walked.
+fn walk<const ONLY_COLORS: bool, const PLANES: usize>(
+    pixels: &Pixels<'_>,
+    (column, row): (usize, usize),
+    (list, lists, color): (&[u32], &Lists, &[[f32; 4]]),
+    (out, plane_out): (&mut [PairSum], &mut [PlaneSum]),
+) -> u32 {
+    let Some(state) = pixels.state::<PLANES>(column, row) else { return 0 };
+    let origin = [(column * LANES) as f32, (row * ROWS) as f32];
+    let (splats, planes) = (&lists.splats[..], &lists.planes[..]);
+    let tile: TileBackward<'_, ONLY_COLORS, PLANES> =
+        TileBackward { state, origin, list, splats, color, planes, out, plane_out };
+    flyrig_types::vectorized(tile)
+}
+
 /// Sums of a chunk of anisotropic Gaussians, to be carried to their attributes.
 struct CarryChunk<'a> {
     rendered: &'a RasterImage,
     /// Index of the chunk's first Gaussian.
     first: usize,
     ins: (&'a [PairSum], &'a [bool]),
+    /// Sums of the planes of all Gaussians; empty for an image without planes.
+    plane_sums: &'a [PlaneSum],
     scale_opacity: &'a [[f32; 4]],
     rotation: &'a [[f32; 4]],
     colors: Harmonics<'a>,
@@ -206,189 +256,21 @@ impl pulp::NullaryFnOnce for CarryChunk<'_> {
 
     #[inline(always)]
     fn call(self) {
-        let Self { rendered, first, ins: (sums, is_touched), scale_opacity, rotation, colors, outs, harmonics_out } =
-            self;
+        let Self { rendered, first, ins, plane_sums, scale_opacity, rotation, colors, outs, harmonics_out } = self;
+        let (sums, is_touched) = ins;
         let ([center_out, scale_out, rotation_out], coefficients) = (outs, colors.coefficients);
         for at in (0..sums.len()).filter(|at| is_touched[*at]) {
             let (sums, i) = (&sums[at], first + at);
             let Some(shape) = Shape::new(&scale_opacity[i], &rotation[i]) else { continue };
             let out = [&mut center_out[at], &mut scale_out[at], &mut rotation_out[at]];
             add_anisotropic(rendered, sums, &colors.center[i], &shape, out);
+            if let Some(sums) = plane_sums.get(i) {
+                let out = [&mut center_out[at], &mut scale_out[at], &mut rotation_out[at]];
+                add_plane(rendered, sums, &colors.center[i], &shape, out);
+            }
             let harmonics_out = &mut harmonics_out[at * coefficients..(at + 1) * coefficients];
             let d_color = Vec3::new(sums[8], sums[9], sums[10]);
             colors.add_backward(i, d_color, &mut center_out[at], harmonics_out);
-        }
-    }
-}
-
-/// Images and incoming derivatives of one view.
-struct Pixels<'a> {
-    size: [usize; 2],
-    color: &'a [[f32; 4]],
-    depth: Option<&'a Vec<f32>>,
-    d_color: &'a [[f32; 4]],
-    d_depth: &'a [[f32; 4]],
-    /// Whether dL/d colour is carried to the Gaussians in place of the last three numbers of `d_depth`.
-    carries_color: bool,
-}
-
-/// Incoming derivatives of a tile's pixels. A pixel without influence starts opaque.
-struct State {
-    transmittance: TileLanes,
-    color: [TileLanes; 3],
-    /// dL/d alpha of the pixel times its final transmittance.
-    passing: TileLanes,
-    /// dL/d depth / alpha; `mean_depth` is the rendered depth.
-    by_depth: TileLanes,
-    mean_depth: TileLanes,
-    carried: [TileLanes; 3],
-    /// Linearised loss of the colours that are still to be blended. Depths are relative to the rendered depth, so that
-    /// theirs sum to 0.
-    behind: TileLanes,
-}
-
-impl Pixels<'_> {
-    /// Returns whether the pixels have derivatives by colour alone, which are those that are carried.
-    fn only_colors(&self) -> bool {
-        self.carries_color && self.depth.is_none()
-    }
-
-    /// Returns the incoming derivatives of a tile; `None` where no pixel has any.
-    fn state(&self, column: usize, row: usize) -> Option<State> {
-        const ZERO: TileLanes = [[0.0; LANES]; ROWS];
-        let mut state = State {
-            transmittance: ZERO,
-            color: [ZERO; 3],
-            passing: ZERO,
-            by_depth: ZERO,
-            mean_depth: ZERO,
-            carried: [ZERO; 3],
-            behind: ZERO,
-        };
-        let mut matters = false;
-        for y in 0..ROWS.min(self.size[1] - row * ROWS) {
-            for x in 0..LANES.min(self.size[0] - column * LANES) {
-                let at = (row * ROWS + y) * self.size[0] + column * LANES + x;
-                let (seen, d_color, mut d_depth) = (self.color[at], self.d_color[at], self.d_depth[at]);
-                if self.depth.is_none() {
-                    d_depth[0] = 0.0;
-                }
-                if self.carries_color {
-                    d_depth[1..].copy_from_slice(&d_color[..3]);
-                }
-                let (color, depth) = (Vec4::from(d_color), Vec4::from(d_depth));
-                let is_zero = color == Vec4::ZERO && depth == Vec4::ZERO;
-                if seen[3] > 0.0 && !is_zero && color.is_finite() && depth.is_finite() {
-                    matters = true;
-                    state.transmittance[y][x] = 1.0;
-                    for c in 0..3 {
-                        state.color[c][y][x] = d_color[c];
-                        state.carried[c][y][x] = d_depth[1 + c];
-                    }
-                    state.passing[y][x] = d_color[3] * (1.0 - seen[3]);
-                    state.behind[y][x] = color.truncate().dot(Vec4::from(seen).truncate());
-                    if let Some(rendered) = self.depth {
-                        state.by_depth[y][x] = d_depth[0] / seen[3].max(1e-6);
-                        state.mean_depth[y][x] = rendered[at];
-                    }
-                }
-            }
-        }
-        matters.then_some(state)
-    }
-}
-
-/// Derivative of a tile's blending. The list is walked front to back again; the light from behind a splat is the
-/// finished pixel less what was blended so far. Writes the sum of each pair and returns the number of pairs walked.
-///
-/// With `ONLY_COLORS`, the pixels' derivatives are those of colours and coverage, and the carried ones those of colours.
-struct TileBackward<'a, const ONLY_COLORS: bool> {
-    state: State,
-    origin: [f32; 2],
-    list: &'a [u32],
-    splats: &'a [ProjectedSplat],
-    color: &'a [[f32; 4]],
-    out: &'a mut [PairSum],
-}
-
-impl<const ONLY_COLORS: bool> pulp::NullaryFnOnce for TileBackward<'_, ONLY_COLORS> {
-    type Output = u32;
-
-    #[inline(always)]
-    fn call(self) -> u32 {
-        let Self { mut state, origin, list, splats, color, out } = self;
-        for (index, (&gaussian, out)) in list.iter().zip(out).enumerate() {
-            let (splat, paint) = (&splats[gaussian as usize], &color[gaussian as usize]);
-            let (mut moments, mut values) = ([[0.0; LANES]; LANES], [[0.0; LANES]; 3]);
-            for row in rows_of(splat, origin[1]) {
-                state.add_row::<ONLY_COLORS>(splat, paint, origin, row, (&mut moments, &mut values));
-            }
-            let moments = sums_of_lanes(&moments);
-            let [a, b, c] = values;
-            let [red, green, blue, ..] = sums_of_lanes(&[a, b, c, a, a, b, c, a]);
-            let [slope, slope_x, slope_y, by_depth, xx, xy, yy, weight] = moments;
-            *out = [slope, slope_x, slope_y, by_depth, xx, xy, yy, weight, red, green, blue];
-            if index % LANES == LANES - 1 && is_opaque(&state.transmittance) {
-                return index as u32 + 1;
-            }
-        }
-        list.len() as u32
-    }
-}
-
-impl State {
-    /// Adds a splat's contribution in a row to its sums.
-    #[inline(always)]
-    fn add_row<const ONLY_COLORS: bool>(
-        &mut self,
-        splat: &ProjectedSplat,
-        paint: &[f32; 4],
-        origin: [f32; 2],
-        row: usize,
-        (moments, values): (&mut [Lanes; LANES], &mut [Lanes; 3]),
-    ) {
-        let exponents = exponents(splat, origin, row);
-        let (opaque, most) = (OPAQUE as f32, MAX_ALPHA as f32);
-        let mut touched = 0u32;
-        for lane in 0..LANES {
-            touched |= u32::from(exponents[lane] >= LOG2_CUT) & u32::from(self.transmittance[row][lane] >= opaque);
-        }
-        if touched == 0 {
-            return;
-        }
-        let dy = origin[1] + row as f32 - splat.pixel.y;
-        for lane in 0..LANES {
-            let dx = origin[0] + lane as f32 - splat.pixel.x;
-            let transmittance = self.transmittance[row][lane];
-            let is_touched = (exponents[lane] >= LOG2_CUT) & (transmittance >= opaque);
-            let unclamped = exp2(exponents[lane]);
-            let clamped = if unclamped < most { unclamped } else { most };
-            let alpha = if is_touched { clamped } else { 0.0 };
-            let weight = alpha * transmittance;
-            let color = [0, 1, 2].map(|c| self.color[c][row][lane]);
-            let mut value = color[0] * paint[0] + color[1] * paint[1] + color[2] * paint[2];
-            if !ONLY_COLORS {
-                let by_depth = self.by_depth[row][lane];
-                value += by_depth * (splat.depth - self.mean_depth[row][lane]);
-                moments[3][lane] += weight * by_depth;
-            }
-            let behind = self.behind[row][lane] - weight * value;
-            self.behind[row][lane] = behind;
-            let by_this_alpha = transmittance * value + (self.passing[row][lane] - behind) / (1.0 - alpha);
-            // dL/d exponent; at the clamp alpha does not follow it.
-            let slope = by_this_alpha * alpha * std::f32::consts::LN_2;
-            let slope = if unclamped < most { slope } else { 0.0 };
-            moments[0][lane] += slope;
-            moments[1][lane] += slope * dx;
-            moments[2][lane] += slope * dy;
-            moments[4][lane] += slope * dx * dx;
-            moments[5][lane] += slope * dx * dy;
-            moments[6][lane] += slope * dy * dy;
-            moments[7][lane] += weight;
-            for (c, values) in values.iter_mut().enumerate() {
-                values[lane] += weight * if ONLY_COLORS { color[c] } else { self.carried[c][row][lane] };
-            }
-            self.transmittance[row][lane] = transmittance * (1.0 - alpha);
         }
     }
 }

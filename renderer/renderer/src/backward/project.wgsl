@@ -4,9 +4,10 @@
 // Complete where the image is smooth: position in the image, depth, and the ellipse's size and shape (with the
 // lens's second derivatives). Nothing flows through what jumps: the cut at CUT, the end at OPAQUE, the order by depth,
 // back-face culling.
-// Lines between "// only isotropic" or "// only anisotropic" and "// end" belong to Gaussians of that kind.
+// Lines between "// only isotropic" or "// only anisotropic" and "// end" belong to Gaussians of that kind, those after "// only
+// planes" to images with planes.
 // Prefix: camera.wgsl, raster/frame.wgsl, backward/frame.wgsl; for isotropic Gaussians const LIFT, for anisotropic ones
-// anisotropic/axes.wgsl, their first three attributes at bindings 2 to 4 and derivatives at 5 to 7.
+// anisotropic/axes.wgsl, with planes anisotropic/plane.wgsl and backward/planes.wgsl, their first three attributes at bindings 2 to 4 and derivatives at 5 to 7.
 @group(0) @binding(0) var<storage, read> frame: Frame;
 @group(0) @binding(1) var<storage, read> sums: array<PairSum>;
 // only isotropic
@@ -198,6 +199,21 @@ fn project_backward(@builtin(workgroup_id) group: vec3<u32>, @builtin(num_workgr
     let d_rotation = vec4(turn * u.w + cross(turn, u.xyz), -dot(turn, u.xyz)) * (2.0 * inverse_length);
     if finite(d_rotation) {
         rotation_out[i] += d_rotation;
+    }
+    // end
+    // only planes
+    let slopes = plane_slopes(frame.camera, p, axes, scale_m, sums[i].vectors[3], sums[i].vectors[4]);
+    let by_plane = slopes.center * camera_from_world;
+    if finite(vec4(by_plane, 0.0)) {
+        center_out[i] += vec4(by_plane, 0.0);
+    }
+    if finite(vec4(slopes.scale, 0.0)) {
+        scale_opacity_out[i] += vec4(slopes.scale, 0.0);
+    }
+    let plane_turn = slopes.turn * camera_from_world;
+    let by_turn = vec4(plane_turn * u.w + cross(plane_turn, u.xyz), -dot(plane_turn, u.xyz)) * (2.0 * inverse_length);
+    if finite(by_turn) {
+        rotation_out[i] += by_turn;
     }
     // end
 }

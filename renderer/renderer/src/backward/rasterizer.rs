@@ -74,7 +74,9 @@ impl BackwardRasterizer {
 
     /// Records the derivatives of an image of anisotropic Gaussians, as [`Self::encode`] does of isotropic ones.
     /// Records nothing for an image of isotropic Gaussians or of another order. Pixels carry only their dL/d colour: of
-    /// [`ImageGradients::depth_carry`] only x is used.
+    /// [`ImageGradients::depth_carry`] only x is used, and nothing where [`ImageGradients::planes`] counts. Its derivatives are
+    /// complete but for the limits of the planes' depths: they follow the standard deviation, and nothing follows where it
+    /// is limited itself.
     ///
     /// # Errors
     /// [`BackwardError`]; nothing is recorded then.
@@ -108,7 +110,12 @@ impl BackwardRasterizer {
         let pixels = latest.size[0] as usize * latest.size[1] as usize;
         check("dL/d colour", incoming.color.len(), pixels)?;
         check("dL/d depth", incoming.depth_carry.len(), pixels)?;
-        check("the rendered image", target.color.len().min(target.depth.len()), pixels)?;
+        let rendered = target.color.len().min(target.depth.len());
+        if let (Some(drawn), Some(by_planes), true) = (&target.planes, &incoming.planes, latest.outputs.planes) {
+            check("the rendered planes", drawn.len(), pixels)?;
+            check("dL/d planes", by_planes.len(), pixels)?;
+        }
+        check("the rendered image", rendered, pixels)?;
         to.check(&latest)?;
         match (&mut self.on, &rasterizer.on) {
             (BackwardOn::Device(device), RasterizerOn::Device(rasterizer)) => {

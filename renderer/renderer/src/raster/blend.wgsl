@@ -3,7 +3,7 @@
 // Four pixels share what is loaded of a splat, which is what the time goes into on Mesa's software adapter.
 // Lines between "// only NAME" and "// end" are left out of kernels that do not write that image: a binding counts
 // against the adapter's limit wherever it is declared and named, reached or not.
-// Prefix: camera.wgsl, raster/frame.wgsl, raster/busy.wgsl, const TILE, CUT, MAX_ALPHA, OPAQUE.
+// Prefix: camera.wgsl, raster/frame.wgsl, raster/busy.wgsl, anisotropic/plane.wgsl with planes, const TILE, CUT, MAX_ALPHA, OPAQUE.
 @group(0) @binding(0) var<storage, read> frame: Frame;
 @group(0) @binding(1) var<storage, read> splats: array<Splat>;
 // only color
@@ -24,6 +24,10 @@
 // only canonical
 @group(0) @binding(8) var<storage, read_write> canonical_out: array<vec4<f32>>;
 // end
+// only planes
+@group(0) @binding(9) var<storage, read> planes: array<Plane>;
+@group(0) @binding(10) var<storage, read_write> planes_out: array<vec4<f32>>;
+// end
 
 const ROWS = 4u;
 const LANES = TILE * TILE / ROWS;
@@ -36,6 +40,9 @@ var<workgroup> batch_color: array<vec3<f32>, BATCH>;
 // end
 // only canonical
 var<workgroup> batch_canonical: array<vec3<f32>, BATCH>;
+// end
+// only planes
+var<workgroup> batch_planes: array<Plane, BATCH>;
 // end
 
 @compute @workgroup_size(TILE, TILE / ROWS)
@@ -64,6 +71,12 @@ fn blend(@builtin(workgroup_id) group: vec3<u32>, @builtin(local_invocation_id) 
     var seen_x = vec4(0.0);
     var seen_y = vec4(0.0);
     var seen_z = vec4(0.0);
+    // only planes
+    var seen_normal_x = vec4(0.0);
+    var seen_normal_y = vec4(0.0);
+    var seen_normal_z = vec4(0.0);
+    var seen_plane = vec4(0.0);
+    // end
     var open = inside && begin < end;
     for (var batch = begin; any_busy(lane, open); batch += BATCH) {
         let count = min(BATCH, end - batch);
@@ -75,6 +88,9 @@ fn blend(@builtin(workgroup_id) group: vec3<u32>, @builtin(local_invocation_id) 
             // end
             // only canonical
             batch_canonical[k] = canonical[g].xyz;
+            // end
+            // only planes
+            batch_planes[k] = planes[g];
             // end
         }
         workgroupBarrier();
@@ -104,6 +120,13 @@ fn blend(@builtin(workgroup_id) group: vec3<u32>, @builtin(local_invocation_id) 
                     seen_y += weight * position.y;
                     seen_z += weight * position.z;
                     // end
+                    // only planes
+                    let plane = batch_planes[k];
+                    seen_normal_x += weight * plane.normal.x;
+                    seen_normal_y += weight * plane.normal.y;
+                    seen_normal_z += weight * plane.normal.z;
+                    seen_plane += weight * (splat.depth / limited(plane, inverse_ratios(plane, dx, dy)));
+                    // end
                     coverage += weight;
                     transmittance *= 1.0 - alpha;
                 }
@@ -128,6 +151,9 @@ fn blend(@builtin(workgroup_id) group: vec3<u32>, @builtin(local_invocation_id) 
         // end
         // only canonical
         canonical_out[at] = vec4(seen_x[row], seen_y[row], seen_z[row], coverage[row]);
+        // end
+        // only planes
+        planes_out[at] = vec4(seen_normal_x[row], seen_normal_y[row], seen_normal_z[row], seen_plane[row]);
         // end
     }
 }

@@ -29,6 +29,8 @@ pub(crate) struct DeviceRasterizer {
     pub(crate) rects: StorageBuffer<[u32; 2]>,
     /// Colours of anisotropic Gaussians as seen from the camera; allocated with the first image of such Gaussians.
     pub(crate) painted: StorageBuffer<[f32; 4]>,
+    /// Planes of anisotropic Gaussians; allocated with the first image that draws them.
+    pub(crate) planes: StorageBuffer<[f32; 8]>,
     pub(crate) pairs_before: StorageBuffer<u32>,
     pair_total: StorageBuffer<u32>,
     /// `struct Work` of bins.wgsl.
@@ -58,6 +60,7 @@ impl DeviceRasterizer {
             splats: StorageBuffer::zeroed(gpu, "splats", max_gaussians)?,
             rects: StorageBuffer::zeroed(gpu, "splat rectangles", max_gaussians)?,
             painted: StorageBuffer::zeroed(gpu, "painted splats", 0)?,
+            planes: StorageBuffer::zeroed(gpu, "planes", 0)?,
             pairs_before: StorageBuffer::zeroed(gpu, "pairs before", max_gaussians)?,
             pair_total: StorageBuffer::zeroed(gpu, "pair total", 1)?,
             work: StorageBuffer::zeroed(gpu, "work on pairs", 12)?,
@@ -81,6 +84,9 @@ impl DeviceRasterizer {
             return Ok(());
         }
         self.grow(gpu, gaussians, target)?;
+        if settings.outputs.planes && gaussians.count() > self.planes.len() {
+            self.planes = StorageBuffer::zeroed(gpu, "planes", gaussians.count())?;
+        }
         let Some(picture) = &self.picture else { return Ok(()) };
         let layout = picture.layout();
         let (first_tile, blended) = tile_range(settings.area, layout.tiles, self.kernels.tile.0);
@@ -101,7 +107,8 @@ impl DeviceRasterizer {
         self.encode_constants(gpu, encoder, &frame, layout);
         self.sort.prepare(encoder);
         let blend = self.kernels.blend(gpu, settings.outputs);
-        let stages = Stages { gpu, rasterizer: self, gaussians, target, picture, blended };
+        let outputs = settings.outputs;
+        let stages = Stages { gpu, rasterizer: self, gaussians, target, picture, blended, outputs };
         let mut pass = |name, record: &dyn Fn(&mut ComputePass<'_>)| {
             let timestamp_writes = timer.as_mut().and_then(|timer| timer.stage(name));
             record(&mut encoder.begin_compute_pass(&ComputePassDescriptor { label: Some(name), timestamp_writes }));
@@ -111,8 +118,7 @@ impl DeviceRasterizer {
         pass("tile lists", &|pass| stages.tile_lists(pass));
         pass("blend", &|pass| stages.blend(pass, &blend));
         let (count, order) = (gaussians.count(), gaussians.order());
-        let (size, outputs) = (frame.size, settings.outputs);
-        self.latest = Some(Latest { gaussians: count, order, size, blended, outputs });
+        self.latest = Some(Latest { gaussians: count, order, size: frame.size, blended, outputs });
         Ok(())
     }
 
@@ -183,6 +189,7 @@ struct Stages<'a> {
     target: &'a RenderTarget,
     picture: &'a ImageBuffers,
     blended: [u32; 2],
+    outputs: Outputs,
 }
 
 impl Stages<'_> {
@@ -202,10 +209,17 @@ impl Stages<'_> {
                 // Bound, and not read, where there is no surface.
                 let normal = g.surface.as_ref().map_or(&g.center, |surface| &surface.normal).raw().as_entire_binding();
                 let (frame_, center_, keyed_) = (frame.clone(), center.clone(), keyed.clone());
-                let resources = [frame_, center_, scale, rotation, normal, splats, rects, keyed_];
+                let (scale_, rotation_) = (scale.clone(), rotation.clone());
+                let resources = [frame_, center_, scale_, rotation_, normal, splats, rects, keyed_];
                 run(gpu, pass, r.kernels.project_anisotropic(gpu), &resources, groups);
-                let resources = [frame, center, harmonics, keyed, r.painted.raw().as_entire_binding()];
+                let painted = r.painted.raw().as_entire_binding();
+                let resources = [frame.clone(), center.clone(), harmonics, keyed.clone(), painted];
                 run(gpu, pass, r.kernels.paint(gpu, g.order()), &resources, groups);
+                if self.outputs.planes {
+                    let planes = r.planes.raw().as_entire_binding();
+                    let resources = [frame, center, scale, rotation, keyed, planes];
+                    run(gpu, pass, r.kernels.planes(gpu), &resources, groups);
+                }
             }
         }
     }
@@ -271,12 +285,16 @@ impl Stages<'_> {
             t.color.raw().as_entire_binding(),
             t.depth.raw().as_entire_binding(),
             t.canonical.raw().as_entire_binding(),
+            r.planes.raw().as_entire_binding(),
+            // No kernel binds planes where there is no image of them.
+            t.planes.as_ref().unwrap_or(&t.color).raw().as_entire_binding(),
         ];
         for (outputs, kernel) in kernels {
             let mut used = vec![0, 1, 4, 5];
             used.extend(if outputs.color { &[2, 6][..] } else { &[] });
             used.extend(if outputs.depth { &[7][..] } else { &[] });
             used.extend(if outputs.canonical { &[3, 8][..] } else { &[] });
+            used.extend(if outputs.planes { &[9, 10][..] } else { &[] });
             run_at(self.gpu, pass, kernel, &numbered(&resources, &used), <(u32, u32)>::from(self.blended));
         }
     }

@@ -19,6 +19,8 @@ const BINS_WGSL: &str = include_str!("bins.wgsl");
 pub(crate) const BUSY_WGSL: &str = include_str!("busy.wgsl");
 const BLEND_WGSL: &str = include_str!("blend.wgsl");
 pub(crate) const AXES_WGSL: &str = include_str!("../anisotropic/axes.wgsl");
+const PLANE_WGSL: &str = include_str!("../anisotropic/plane.wgsl");
+const PLANES_WGSL: &str = include_str!("planes.wgsl");
 const HARMONICS_WGSL: &str = include_str!("../anisotropic/harmonics.wgsl");
 const PAINT_WGSL: &str = include_str!("../anisotropic/paint.wgsl");
 
@@ -41,6 +43,14 @@ pub const BACKFACING_COSINE: f64 = 0.35;
 /// that the far side of a body would show through the near one. Lower values cut the silhouette, where fitted Gaussians
 /// are rounder than the mesh: 0.35 costs 0.09 dB on d1 (docs/benchmarks/avatar.md).
 pub const AWAY_COSINE: f64 = 0.7;
+
+/// Standard deviations along camera z that a plane's depth keeps to, about the depth of the centre.
+pub(crate) const REACH: f32 = 3.0;
+/// Largest distance of a plane's depth from that of the centre, as a share of the latter.
+pub(crate) const MOST_REACH: f32 = 0.9;
+/// Least product of a plane's unit normal and the ray through the Gaussian's centre with z = 1: a plane closer to edge-on than this
+/// (0.6 degrees) has the depths of one at this angle.
+pub(crate) const LEAST_COSINE: f32 = 0.01;
 
 /// Side of a tile, pixels; a multiple of the four rows that one invocation blends.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -113,19 +123,36 @@ pub(crate) fn bins_wgsl() -> String {
     [&constants, CAMERA_WGSL, FRAME_WGSL, BINS_WGSL].concat()
 }
 
-/// Returns the WGSL that blends these outputs; at most two of them fit the bindings of one kernel.
+/// Returns the WGSL that blends these outputs; at most two of them fit the bindings of one kernel ([`blend_passes`]).
 pub(crate) fn blend_wgsl(tile: Tile, outputs: Outputs) -> String {
-    let Outputs { color, depth, canonical } = outputs;
+    let Outputs { color, depth, canonical, planes } = outputs;
     let of_outputs = sections(BLEND_WGSL, |name| match name {
         "color" => color,
         "depth" => depth,
+        "planes" => planes,
         _ => canonical,
     });
-    [&tile.wgsl(), CAMERA_WGSL, FRAME_WGSL, BUSY_WGSL, &of_outputs].concat()
+    let plane = if planes { plane_wgsl() } else { String::new() };
+    [&tile.wgsl(), CAMERA_WGSL, FRAME_WGSL, BUSY_WGSL, &plane, &of_outputs].concat()
+}
+
+/// Returns the WGSL of the planes of anisotropic Gaussians.
+pub(crate) fn plane_wgsl() -> String {
+    let constants = format!(
+        "const LEAST_COSINE: f32 = {LEAST_COSINE};\nconst REACH: f32 = {REACH};\nconst MOST_REACH: f32 = {MOST_REACH};\n"
+    );
+    [&constants, PLANE_WGSL].concat()
+}
+
+/// Returns the WGSL that computes the planes of an image.
+pub(crate) fn planes_wgsl() -> String {
+    let constants = format!("const INVALID_KEY: u32 = {INVALID_KEY}u;\n");
+    let attributes = bindings_wgsl(1, &[CENTER, SCALE_OPACITY, ROTATION]);
+    [&constants, CAMERA_WGSL, FRAME_WGSL, &attributes, AXES_WGSL, &plane_wgsl(), PLANES_WGSL].concat()
 }
 
 /// Returns the WGSL without the lines between `// only NAME` and `// end` whose name `keeps` rejects.
-fn sections(source: &str, keeps: impl Fn(&str) -> bool) -> String {
+pub(crate) fn sections(source: &str, keeps: impl Fn(&str) -> bool) -> String {
     let mut kept = String::new();
     let mut keep = true;
     for line in source.lines() {
@@ -139,13 +166,21 @@ fn sections(source: &str, keeps: impl Fn(&str) -> bool) -> String {
     kept
 }
 
-/// Returns the sections for one kind of Gaussians.
+/// Returns the sections for one kind of Gaussians, without those of planes.
 pub(crate) fn of_kind(source: &str, is_anisotropic: bool) -> String {
-    sections(source, |name| (name == "anisotropic") == is_anisotropic)
+    sections(source, |name| name == if is_anisotropic { "anisotropic" } else { "isotropic" })
 }
+
+/// No image.
+const NOTHING: Outputs = Outputs { color: false, depth: false, canonical: false, planes: false };
 
 /// Splits `outputs` over kernels that bind at most 8 buffers each; returns their outputs and their number.
 pub(crate) fn blend_passes(outputs: Outputs) -> ([Outputs; 2], usize) {
+    if outputs.planes {
+        let first = Outputs { color: outputs.color, planes: true, ..NOTHING };
+        let rest = Outputs { color: false, planes: false, ..outputs };
+        return ([first, rest], if rest == NOTHING { 1 } else { 2 });
+    }
     let surface = Outputs { depth: false, ..outputs };
     let depth = Outputs { color: false, canonical: false, ..outputs };
     if outputs == Outputs::ALL { ([surface, depth], 2) } else { ([outputs; 2], 1) }
@@ -161,6 +196,7 @@ pub(crate) struct RasterKernels {
     pub end_lists: ComputeKernel,
     blend: Mutex<HashMap<Outputs, Arc<ComputeKernel>>>,
     project_anisotropic: OnceLock<ComputeKernel>,
+    planes: OnceLock<ComputeKernel>,
     /// One kernel per harmonic order.
     paint: [OnceLock<ComputeKernel>; 3],
 }
@@ -178,6 +214,7 @@ impl RasterKernels {
             end_lists: bin_kernel("end_lists"),
             blend: Mutex::default(),
             project_anisotropic: OnceLock::new(),
+            planes: OnceLock::new(),
             paint: Default::default(),
         };
         // What a live session draws; anything else is compiled with the first image that asks for it.
@@ -201,6 +238,11 @@ impl RasterKernels {
     pub(crate) fn project_anisotropic(&self, gpu: &GpuContext) -> &ComputeKernel {
         let compile = || ComputeKernel::new(gpu, "project", &[&project_anisotropic_wgsl(self.tile)], "project");
         self.project_anisotropic.get_or_init(compile)
+    }
+
+    /// Returns the kernel that computes planes; compiles it on first use.
+    pub(crate) fn planes(&self, gpu: &GpuContext) -> &ComputeKernel {
+        self.planes.get_or_init(|| ComputeKernel::new(gpu, "planes", &[&planes_wgsl()], "place_planes"))
     }
 
     /// Returns the kernel that colours anisotropic Gaussians; compiles it on first use.

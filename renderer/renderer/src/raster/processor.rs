@@ -12,6 +12,7 @@
 pub(crate) mod blend;
 pub(crate) mod lanes;
 pub(crate) mod lists;
+pub(crate) mod planes;
 pub(crate) mod project;
 pub(crate) mod rasterizer;
 pub(crate) mod shape;

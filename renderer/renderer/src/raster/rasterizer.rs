@@ -24,6 +24,8 @@ use crate::raster::settings::{RasterSettings, RasterStats};
 /// - A Gaussian with a non-finite number, with scale or opacity not above 0, behind [`RasterSettings::near_m`], beyond
 ///   1e9 m, or outside the lens's valid radius is not drawn.
 /// - [`AnisotropicBuffers`](crate::AnisotropicBuffers) share all steps after projection and colouring.
+/// - Their normals and the depths on their planes ([`RenderTarget::planes`](crate::RenderTarget::planes)) are drawn where
+///   [`Outputs::planes`](crate::Outputs::planes) asks for them; otherwise no kernel computes them.
 /// - Buffers and pipelines are created once and grow with the image and the number of Gaussians.
 ///
 /// # Examples
@@ -116,7 +118,7 @@ impl Rasterizer {
         timer: Option<&mut GpuTimer>,
     ) -> Result<(), GpuError> {
         let gaussians = gaussians.into();
-        let settings = settings.for_kind(gaussians);
+        let settings = settings.for_kind(gaussians, target);
         match &mut self.on {
             RasterizerOn::Device(device) => {
                 device.encode_timed(gpu, encoder, gaussians, (camera, &settings), target, timer)

@@ -2,6 +2,7 @@
 
 use crate::anisotropic::buffers::Gaussians;
 use crate::anisotropic::order::HarmonicOrder;
+use crate::buffers::RenderTarget;
 
 /// Selection of the images of a [`crate::RenderTarget`] that are written; the others keep their content.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
@@ -12,15 +13,20 @@ pub struct Outputs {
     pub depth: bool,
     /// Whether [`crate::RenderTarget::canonical`] is written.
     pub canonical: bool,
+    /// Whether [`crate::RenderTarget::planes`] is written. Ignored for isotropic Gaussians and for a target without
+    /// that image.
+    pub planes: bool,
 }
 
 impl Outputs {
-    /// All images.
-    pub const ALL: Self = Self { color: true, depth: true, canonical: true };
+    /// Colour, alpha, depth of the centres, and canonical positions: the images that every target has.
+    pub const ALL: Self = Self { color: true, depth: true, canonical: true, planes: false };
     /// Colour and alpha only.
-    pub const COLOR: Self = Self { color: true, depth: false, canonical: false };
+    pub const COLOR: Self = Self { color: true, depth: false, canonical: false, planes: false };
     /// Colour, alpha and canonical positions: the inputs of direct appearance.
-    pub const SURFACE: Self = Self { color: true, depth: false, canonical: true };
+    pub const SURFACE: Self = Self { color: true, depth: false, canonical: true, planes: false };
+    /// Colour, alpha, normals and plane depth of anisotropic Gaussians: the inputs of a fit to depths and normals.
+    pub const PLANES: Self = Self { color: true, depth: false, canonical: false, planes: true };
 }
 
 /// Settings of a rendering.
@@ -49,13 +55,17 @@ impl Default for RasterSettings {
 }
 
 impl RasterSettings {
-    /// Returns the settings that apply to this kind of Gaussians.
-    pub(crate) fn for_kind(&self, gaussians: Gaussians<'_>) -> Self {
+    /// Returns the settings that apply to this kind of Gaussians, drawn to this target.
+    pub(crate) fn for_kind(&self, gaussians: Gaussians<'_>, target: &RenderTarget) -> Self {
+        let has_planes = target.planes.as_ref().is_some_and(|planes| planes.len() >= target.color.len());
+        let planes = self.outputs.planes && has_planes;
         match gaussians {
-            Gaussians::Isotropic(_) => *self,
-            Gaussians::Anisotropic(gaussians) if gaussians.surface.is_some() => *self,
+            Gaussians::Isotropic(_) => Self { outputs: Outputs { planes: false, ..self.outputs }, ..*self },
+            Gaussians::Anisotropic(gaussians) if gaussians.surface.is_some() => {
+                Self { outputs: Outputs { planes, ..self.outputs }, ..*self }
+            }
             Gaussians::Anisotropic(_) => {
-                let outputs = Outputs { canonical: false, ..self.outputs };
+                let outputs = Outputs { canonical: false, planes, ..self.outputs };
                 Self { cull_backfacing: false, outputs, ..*self }
             }
         }

@@ -4,6 +4,7 @@
 pub mod anisotropic;
 pub mod anisotropic_run;
 pub mod body_scene;
+pub mod planes;
 pub mod random_scene;
 pub mod reference;
 pub mod reference_backward;

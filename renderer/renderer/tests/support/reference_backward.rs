@@ -35,7 +35,8 @@ pub struct Touched {
     pub unclear: Vec<bool>,
 }
 
-fn unclamped_alpha(s: &Splat, x: f64, y: f64) -> f64 {
+/// Alpha of a splat in a pixel, before the clamp.
+pub fn unclamped_alpha(s: &Splat, x: f64, y: f64) -> f64 {
     let d = DVec2::new(x, y) - s.pixel;
     s.opacity * (-0.5 * (s.xx * d.x * d.x + 2.0 * s.xy * d.x * d.y + s.yy * d.y * d.y)).exp()
 }

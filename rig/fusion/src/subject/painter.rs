@@ -210,10 +210,7 @@ impl DirectPainter {
     fn render_views(&mut self, inputs: PaintInputs<'_>, tools: &mut PaintTools<'_>) -> Result<(), FusionError> {
         let PaintInputs { gpu, geometry, instants, views, .. } = inputs;
         let start = Instant::now();
-        let settings = RasterSettings {
-            outputs: Outputs { color: true, depth: false, canonical: true },
-            ..RasterSettings::default()
-        };
+        let settings = RasterSettings { outputs: Outputs::SURFACE, ..RasterSettings::default() };
         for (i, view) in views.iter().enumerate() {
             self.fit_target(gpu, i, (view.image.width(), view.image.height()))?;
             let mut encoder = gpu.device.create_command_encoder(&Default::default());

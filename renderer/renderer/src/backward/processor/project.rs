@@ -85,15 +85,19 @@ pub(super) fn add_anisotropic(
     // length: du = (turn, 0) u / 2.
     let turn: Vec3 =
         [0, 1, 2].map(|k| scaled.col(k).cross(view.jacobian.map(|along| along.dot(d_rows[k])).into())).iter().sum();
-    let turn = view.world_from_camera * turn;
+    add(rotation_out, by_quaternion(shape, view.world_from_camera * turn));
+}
+
+/// Carries the slope by a small turn in the world to the stored quaternion.
+#[inline(always)]
+pub(super) fn by_quaternion(shape: &Shape, turn: Vec3) -> Vec4 {
     let (u, w) = (shape.unit.truncate(), shape.unit.w);
-    let d_rotation = (turn * w + turn.cross(u)).extend(-turn.dot(u));
-    add(rotation_out, d_rotation * (2.0 * shape.inverse_length));
+    (turn * w + turn.cross(u)).extend(-turn.dot(u)) * (2.0 * shape.inverse_length)
 }
 
 /// Adds finite values only.
 #[inline(always)]
-fn add(out: &mut [f32; 4], more: Vec4) {
+pub(super) fn add(out: &mut [f32; 4], more: Vec4) {
     if more.is_finite() {
         *out = (Vec4::from(*out) + more).to_array();
     }
@@ -161,7 +165,7 @@ impl<'a> ProjectedPoint<'a> {
 
 /// Returns dL/d ideal image point through the lens's Jacobian, given dL/d Jacobian by columns.
 #[inline(always)]
-fn through_lens_jacobian(camera: &CameraConstants, ideal: Vec2, d: [Vec2; 2]) -> Vec2 {
+pub(super) fn through_lens_jacobian(camera: &CameraConstants, ideal: Vec2, d: [Vec2; 2]) -> Vec2 {
     let Vec2 { x, y } = ideal;
     let r2 = ideal.length_squared();
     let [k1, k2, k3, k4, ..] = camera.coefficients;

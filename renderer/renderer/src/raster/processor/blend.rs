@@ -2,6 +2,7 @@
 
 use crate::raster::kernels::{MAX_ALPHA, OPAQUE};
 use crate::raster::processor::lanes::{LANES, Lanes, exp2};
+use crate::raster::processor::planes::Plane;
 use crate::raster::processor::project::{ProjectedSplat, TILE};
 use crate::raster::settings::Outputs;
 
@@ -12,17 +13,22 @@ const OPAQUE_EVERY: usize = 8;
 /// One number per pixel of a tile, row by row.
 pub(crate) type TileLanes = [Lanes; ROWS];
 
-/// Accumulators of a tile: sums of weight times value; `coverage` is the sum of the weights.
+/// Number of sums of a plane: three of the normal, then the depth.
+pub(crate) const PLANE_SUMS: usize = 4;
+
+/// Accumulators of a tile: sums of weight times value; `coverage` is the sum of the weights. `PLANES` is [`PLANE_SUMS`] where
+/// planes are drawn, otherwise 0.
 #[derive(Debug, Clone)]
-pub(crate) struct BlendedTile {
+pub(crate) struct BlendedTile<const PLANES: usize> {
     pub transmittance: TileLanes,
     pub coverage: TileLanes,
     pub color: [TileLanes; 3],
     pub depth: TileLanes,
     pub canonical: [TileLanes; 3],
+    pub planes: [TileLanes; PLANES],
 }
 
-impl BlendedTile {
+impl<const PLANES: usize> BlendedTile<PLANES> {
     fn new() -> Self {
         const ZERO: TileLanes = [[0.0; LANES]; ROWS];
         Self {
@@ -31,12 +37,13 @@ impl BlendedTile {
             color: [ZERO; 3],
             depth: ZERO,
             canonical: [ZERO; 3],
+            planes: [ZERO; PLANES],
         }
     }
 }
 
-/// Front-to-back blending of a tile's list.
-pub(crate) struct BlendTile<'a> {
+/// Front-to-back blending of a tile's list. Without `PLANES`, nothing of planes is compiled.
+pub(crate) struct BlendTile<'a, const PLANES: usize> {
     /// First pixel of the tile.
     pub origin: [f32; 2],
     /// Indices of Gaussians, nearest first.
@@ -44,14 +51,15 @@ pub(crate) struct BlendTile<'a> {
     pub splats: &'a [ProjectedSplat],
     pub color: &'a [[f32; 4]],
     pub canonical: &'a [[f32; 4]],
+    pub planes: &'a [Plane],
     pub outputs: Outputs,
 }
 
-impl pulp::NullaryFnOnce for BlendTile<'_> {
-    type Output = BlendedTile;
+impl<const PLANES: usize> pulp::NullaryFnOnce for BlendTile<'_, PLANES> {
+    type Output = BlendedTile<PLANES>;
 
     #[inline(always)]
-    fn call(self) -> BlendedTile {
+    fn call(self) -> BlendedTile<PLANES> {
         let mut tile = BlendedTile::new();
         for (index, &gaussian) in self.list.iter().enumerate() {
             let splat = &self.splats[gaussian as usize];
@@ -71,6 +79,14 @@ impl pulp::NullaryFnOnce for BlendTile<'_> {
                     let position = &self.canonical[gaussian as usize];
                     for (sum, value) in tile.canonical.iter_mut().zip(position) {
                         add(&mut sum[row], &weight, *value);
+                    }
+                }
+                if PLANES > 0 {
+                    let plane = &self.planes[gaussian as usize];
+                    let [x, y, z] = plane.normal.map(|value| [value; LANES]);
+                    let values = [x, y, z, plane.depths(splat, self.origin, row)];
+                    for (sum, values) in tile.planes.iter_mut().zip(&values) {
+                        add_each(&mut sum[row], &weight, values);
                     }
                 }
             }
@@ -136,6 +152,13 @@ pub(crate) const LOG2_CUT: f32 = -7.994_353_4;
 fn add(sum: &mut Lanes, weight: &Lanes, value: f32) {
     for lane in 0..LANES {
         sum[lane] += weight[lane] * value;
+    }
+}
+
+#[inline(always)]
+fn add_each(sum: &mut Lanes, weight: &Lanes, values: &Lanes) {
+    for lane in 0..LANES {
+        sum[lane] += weight[lane] * values[lane];
     }
 }
 

@@ -2,10 +2,12 @@
 
 use std::time::{Duration, Instant};
 
+use flyrig_gpu::CameraConstants;
 use rayon::prelude::*;
 
 use crate::anisotropic::harmonics::Harmonics;
 use crate::raster::buffers::pair_capacity;
+use crate::raster::processor::planes::{Plane, PlaneChunk};
 use crate::raster::processor::project::{ProjectedSplat, Projection, Rect, TILE};
 
 /// Gaussians per projection task.
@@ -92,6 +94,8 @@ pub(crate) struct Lists {
     /// Colour per Gaussian as seen from the camera, where colours depend on the direction; stale where the Gaussian is
     /// not drawn.
     pub painted: Vec<[f32; 4]>,
+    /// Plane per Gaussian; stale where the image draws no planes or the Gaussian is not drawn.
+    pub planes: Vec<Plane>,
     /// Drawn Gaussians of each chunk.
     visible: Vec<Vec<Ranked>>,
     /// Drawn Gaussians, nearest first.
@@ -145,6 +149,16 @@ impl Lists {
         let chunks = self.painted.par_chunks_mut(CHUNK).zip(&mut self.visible);
         chunks.enumerate().for_each(|(chunk, (painted, visible))| {
             flyrig_types::vectorized(PaintChunk { harmonics, first: chunk * CHUNK, painted, visible });
+        });
+    }
+
+    /// Computes the planes of the Gaussians.
+    pub fn fill_planes(&mut self, camera: &CameraConstants, gaussians: Anisotropic<'_>) {
+        let Anisotropic { colors: Harmonics { center, .. }, scale_opacity, rotation, .. } = gaussians;
+        self.planes.resize(gaussians.count(), Plane::default());
+        self.planes.par_chunks_mut(CHUNK).enumerate().for_each(|(chunk, planes)| {
+            let first = chunk * CHUNK;
+            flyrig_types::vectorized(PlaneChunk { camera, first, center, scale_opacity, rotation, planes });
         });
     }
 

@@ -2,7 +2,7 @@
 
 use std::time::{Duration, Instant};
 
-use flyrig_gpu::CameraConstants;
+use flyrig_gpu::{CameraConstants, StorageBuffer};
 use flyrig_types::Camera;
 use rayon::prelude::*;
 
@@ -10,7 +10,7 @@ use crate::anisotropic::buffers::Gaussians;
 use crate::anisotropic::harmonics::Harmonics;
 use crate::anisotropic::order::HarmonicOrder;
 use crate::buffers::RenderTarget;
-use crate::raster::processor::blend::{BlendTile, BlendedTile};
+use crate::raster::processor::blend::{BlendTile, BlendedTile, PLANE_SUMS};
 use crate::raster::processor::lanes::LANES;
 use crate::raster::processor::lists::{Anisotropic, Isotropic, Lists};
 use crate::raster::processor::project::{Projection, TILE};
@@ -59,13 +59,13 @@ impl ProcessorRasterizer {
         let projection = Projection { camera: constants, size, settings };
         let tiles = match gaussians {
             Gaussians::Isotropic(buffers) => {
-                let slices = buffers.attributes().map(flyrig_gpu::StorageBuffer::slice);
+                let slices = buffers.attributes().map(StorageBuffer::slice);
                 let [Some(center_scale), Some(normal), Some(color), Some(canonical)] = &slices else { return };
                 self.lists.fill(&projection, Isotropic { center_scale, normal, color, canonical });
                 self.blend(&projection, color, canonical, target)
             }
             Gaussians::Anisotropic(buffers) => {
-                let slices = buffers.attributes().map(flyrig_gpu::StorageBuffer::slice);
+                let slices = buffers.attributes().map(StorageBuffer::slice);
                 let [Some(center), Some(scale_opacity), Some(rotation), Some(harmonics)] = &slices else { return };
                 let coefficients = buffers.order().coefficients();
                 let colors = Harmonics { center, harmonics, coefficients, eye: constants.center() };
@@ -76,7 +76,11 @@ impl ProcessorRasterizer {
                     Some(_) => return,
                     None => (None, &[][..]),
                 };
-                self.lists.fill(&projection, Anisotropic { colors, scale_opacity, rotation, normal });
+                let anisotropic = Anisotropic { colors, scale_opacity, rotation, normal };
+                self.lists.fill(&projection, anisotropic);
+                if settings.outputs.planes {
+                    self.lists.fill_planes(&constants, anisotropic);
+                }
                 let painted = std::mem::take(&mut self.lists.painted);
                 let tiles = self.blend(&projection, &painted, canonical, target);
                 self.lists.painted = painted;
@@ -99,11 +103,13 @@ impl ProcessorRasterizer {
         let Projection { size, settings, .. } = *projection;
         self.overflowed_images += u32::from(self.lists.overflowed);
         let (first_tile, blended) = tile_range(settings.area, self.lists.tiles, TILE);
-        let Outputs { color: with_color, depth: with_depth, canonical: with_canonical } = settings.outputs;
+        let Outputs { color: with_color, depth: with_depth, canonical: with_canonical, planes: with_planes } =
+            settings.outputs;
         let mut pictures = (
             target.color.slice_mut().filter(|_| with_color),
             target.depth.slice_mut().filter(|_| with_depth),
             target.canonical.slice_mut().filter(|_| with_canonical),
+            target.planes.as_ref().and_then(StorageBuffer::slice_mut).filter(|_| with_planes),
         );
         let start = Instant::now();
         let row_of_tiles = (size[0] * TILE) as usize;
@@ -118,6 +124,9 @@ impl ProcessorRasterizer {
         if let Some(canonical) = &mut pictures.2 {
             bands.iter_mut().zip(canonical.chunks_mut(row_of_tiles)).for_each(|(band, part)| band.canonical = part);
         }
+        if let Some(planes) = &mut pictures.3 {
+            bands.iter_mut().zip(planes.chunks_mut(row_of_tiles)).for_each(|(band, part)| band.planes = part);
+        }
         let rows = first_tile[1] as usize..(first_tile[1] + blended[1]) as usize;
         let bands = bands.get_mut(rows)?;
         let lists = &self.lists;
@@ -130,15 +139,18 @@ impl ProcessorRasterizer {
                     band.clear(size[0] as usize, left);
                     continue;
                 }
-                let tile = flyrig_types::vectorized(BlendTile {
-                    origin: [(column * TILE) as f32, (row * TILE) as f32],
-                    list,
-                    splats: &lists.splats,
-                    color: colors,
-                    canonical: positions,
-                    outputs: settings.outputs,
-                });
-                band.write(&tile, size[0] as usize, left);
+                let origin = [(column * TILE) as f32, (row * TILE) as f32];
+                let (splats, planes, outputs) = (&lists.splats[..], &lists.planes[..], settings.outputs);
+                let (color, canonical, width) = (colors, positions, size[0] as usize);
+                if with_planes {
+                    let tile: BlendTile<'_, PLANE_SUMS> =
+                        BlendTile { origin, list, splats, color, canonical, planes, outputs };
+                    band.write(&flyrig_types::vectorized(tile), width, left);
+                } else {
+                    let tile: BlendTile<'_, 0> =
+                        BlendTile { origin, list, splats, color, canonical, planes: &[], outputs };
+                    band.write(&flyrig_types::vectorized(tile), width, left);
+                }
             }
         });
         self.blend_time = start.elapsed();
@@ -171,6 +183,7 @@ struct Band<'a> {
     color: &'a mut [[f32; 4]],
     depth: &'a mut [f32],
     canonical: &'a mut [[f32; 4]],
+    planes: &'a mut [[f32; 4]],
 }
 
 impl Band<'_> {
@@ -180,10 +193,11 @@ impl Band<'_> {
         self.color.chunks_mut(width).for_each(|pixels| pixels[columns.clone()].fill([0.0; 4]));
         self.depth.chunks_mut(width).for_each(|pixels| pixels[columns.clone()].fill(0.0));
         self.canonical.chunks_mut(width).for_each(|pixels| pixels[columns.clone()].fill([0.0; 4]));
+        self.planes.chunks_mut(width).for_each(|pixels| pixels[columns.clone()].fill([0.0; 4]));
     }
 
     /// Writes a tile whose first pixel is in column `left`.
-    fn write(&mut self, tile: &BlendedTile, width: usize, left: usize) {
+    fn write<const PLANES: usize>(&mut self, tile: &BlendedTile<PLANES>, width: usize, left: usize) {
         let columns = LANES.min(width - left);
         let three = |sums: &[[[f32; LANES]; LANES]; 3], row: usize, lane: usize| {
             [sums[0][row][lane], sums[1][row][lane], sums[2][row][lane], tile.coverage[row][lane]]
@@ -202,6 +216,11 @@ impl Band<'_> {
         for (row, pixels) in self.canonical.chunks_mut(width).enumerate() {
             for (lane, pixel) in pixels[left..left + columns].iter_mut().enumerate() {
                 *pixel = three(&tile.canonical, row, lane);
+            }
+        }
+        for (row, pixels) in self.planes.chunks_mut(width).enumerate() {
+            for (lane, pixel) in pixels[left..left + columns].iter_mut().enumerate() {
+                pixel.iter_mut().zip(&tile.planes).for_each(|(value, sums)| *value = sums[row][lane]);
             }
         }
     }
