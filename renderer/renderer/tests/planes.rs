@@ -129,7 +129,7 @@ fn flat(surface: &[(DVec3, DVec3)], scale: f32, thickness: f32) -> Ellipsoids {
     for (i, (point, normal)) in surface.iter().enumerate() {
         let spin = DQuat::from_rotation_z(rng.random_range(0.0..6.0));
         scene.center[i] = point.as_vec3().extend(0.0).to_array();
-        scene.scale_opacity[i] = [scale, scale, thickness, 0.8];
+        scene.scale_opacity[i] = [scale, scale, thickness, 0.95];
         scene.rotation[i] = (DQuat::from_rotation_arc(DVec3::Z, *normal) * spin).as_quat().to_array();
     }
     scene
@@ -186,7 +186,8 @@ fn a_tilted_wall_has_its_depth_where_that_of_the_centres_is_off() {
             angle.to_degrees()
         );
         assert!(seen > 8000.0, "{seen} pixels show the wall");
-        assert!(by_plane < 1e-3 && worst < 0.01 * scale && by_center > 0.1 && by_center > 100.0 * by_plane);
+        // The faint rim of a Gaussian beyond three deviations is all that is off.
+        assert!(by_plane < 5e-3 && worst < 0.02 * scale && by_center > 0.5 && by_center > 100.0 * by_plane);
         assert!(angle.to_degrees() < 0.1);
     });
 }
@@ -196,7 +197,7 @@ fn a_sphere_has_its_normals_and_depths() {
     on_both(|gpu| {
         let (radius, scale, camera) = (0.5, 0.012, pinhole(160));
         let golden = std::f64::consts::PI * (3.0 - 5f64.sqrt());
-        let count = 6000;
+        let count = 24_000;
         let point = |i: i32| {
             let z = 1.0 - (2.0 * f64::from(i) + 1.0) / f64::from(count);
             let (sin, cos) = (golden * f64::from(i)).sin_cos();
@@ -230,7 +231,8 @@ fn a_sphere_has_its_normals_and_depths() {
             "{}: normals mean {mean:.2}, 99 % {high:.2} degrees; depth in scales: planes {by_plane:.3}, centres {by_center:.3}",
             gpu.adapter_name()
         );
-        assert!(seen > 3000.0 && mean < 2.0 && high < 5.0 && by_plane < 0.1 && by_plane < 0.5 * by_center);
+        // Blending prefers the Gaussians that are nearer to the camera: normals are those of a place 1.5 scales from there.
+        assert!(seen > 3000.0 && mean < 2.5 && high < 3.5 && by_plane < 0.1 && by_plane < 0.2 * by_center);
     });
 }
 
