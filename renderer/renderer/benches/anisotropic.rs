@@ -3,6 +3,8 @@
 //!
 //! `cargo bench -p flyrig-renderer --bench anisotropic -- [COUNT...]`
 //!
+//! The row "planes" draws Gaussians of order 2 with normals and plane depths, and differentiates by them as well.
+//!
 //! With `scenes N` in place of counts: errors of the derivatives over N small random scenes, and for ever longer needles.
 
 #[path = "../tests/support/mod.rs"]
@@ -136,6 +138,9 @@ fn compare(contexts: &[&GpuContext], count: usize) -> Result<(), Box<dyn Error>>
         for (variant, _) in &others {
             rows.push(Row::anisotropic(gpu, variant)?);
         }
+        if let Some((variant, _)) = others.last() {
+            rows.push(Row::anisotropic(gpu, variant)?.with_planes(gpu)?);
+        }
         for run in 0..RUNS + 2 {
             for row in &mut rows {
                 row.measure(gpu, &view, run >= 2)?;
@@ -144,9 +149,11 @@ fn compare(contexts: &[&GpuContext], count: usize) -> Result<(), Box<dyn Error>>
         let [forward, backward] = [&rows[0].forwards, &rows[0].backwards].map(|times| median(times));
         for (i, row) in rows.iter().enumerate() {
             let found = row.errors(gpu)?;
-            let (name, picture, errors) = match i.checked_sub(1).and_then(|i| others.get(i)) {
+            let (name, picture, errors) = match i.checked_sub(1).and_then(|i| others.get(i).or(others.last())) {
                 Some((variant, slopes)) => {
-                    (format!("{:?}", variant.scene.order), &variant.picture, errors(&found, slopes).to_vec())
+                    let with_planes = row.settings.outputs.planes;
+                    let name = if with_planes { "planes".to_owned() } else { format!("{:?}", variant.scene.order) };
+                    (name, &variant.picture, errors(&found, slopes).to_vec())
                 }
                 None => {
                     let off: f64 = found[0].iter().zip(&centers).map(|(a, b)| (vec3(*a) - *b).length_squared()).sum();
@@ -206,6 +213,7 @@ enum Buffers {
 /// One line of the table while it is measured.
 struct Row {
     buffers: Buffers,
+    settings: RasterSettings,
     rasterizer: Rasterizer,
     backward: BackwardRasterizer,
     target: RenderTarget,
@@ -232,6 +240,7 @@ impl Row {
         gradients.color.write(gpu, &incoming.color);
         Ok(Self {
             buffers,
+            settings: SETTINGS,
             rasterizer: Rasterizer::new(gpu, 0)?,
             backward: BackwardRasterizer::new(gpu)?,
             target: RenderTarget::new(gpu, SIZE, SIZE)?,
@@ -239,6 +248,13 @@ impl Row {
             forwards: Vec::new(),
             backwards: Vec::new(),
         })
+    }
+
+    /// Adds the planes, with a gradient of 0: it costs as much as any other.
+    fn with_planes(self, gpu: &GpuContext) -> Result<Self, Box<dyn Error>> {
+        let settings = RasterSettings { outputs: Outputs::PLANES, ..SETTINGS };
+        let (target, incoming) = (self.target.with_planes(gpu)?, self.incoming.with_planes(gpu)?);
+        Ok(Self { settings, target, incoming, ..self })
     }
 
     /// Draws the image and takes its derivative. On a graphics processor several times in one submission, so that the wait
@@ -250,10 +266,10 @@ impl Row {
         for _ in 0..repeats {
             match &self.buffers {
                 Buffers::Isotropic(g, _) => {
-                    self.rasterizer.encode(gpu, &mut encoder, g, view, &SETTINGS, &self.target)?;
+                    self.rasterizer.encode(gpu, &mut encoder, g, view, &self.settings, &self.target)?;
                 }
                 Buffers::Anisotropic(g, _) => {
-                    self.rasterizer.encode(gpu, &mut encoder, g, view, &SETTINGS, &self.target)?;
+                    self.rasterizer.encode(gpu, &mut encoder, g, view, &self.settings, &self.target)?;
                 }
             }
         }

@@ -169,7 +169,7 @@ fn without_plane_gradients_the_derivatives_keep_their_bytes() {
         let camera = random_camera(&mut rng, LENSES[1], 100, 70);
         let by = PlaneIncoming::random(&mut rng, &vec![false; 100 * 70]);
         let incoming = by.with_depths(&mut rng);
-        let mut run_as = |outputs: Outputs, planes: Option<&[[f32; 4]]>| {
+        let run_as = |outputs: Outputs, planes: Option<&[[f32; 4]]>| {
             let mut kernels = Kernels::new(gpu);
             let settings = RasterSettings { outputs, ..SETTINGS };
             let pair = (&mut kernels.forward, &mut kernels.backward);

@@ -139,8 +139,16 @@ impl<const ONLY_COLORS: bool, const PLANES: usize> pulp::NullaryFnOnce for TileB
             let (mut moments, mut values) = ([[0.0; LANES]; LANES], [[0.0; LANES]; 3]);
             let mut plane_moments = [[0.0; LANES]; LANES];
             for row in rows_of(splat, origin[1]) {
-                let sums = (&mut moments, &mut values, &mut plane_moments);
-                state.add_row::<ONLY_COLORS>((splat, paint, &plane), origin, row, sums);
+                if PLANES > 0 {
+                    let inverse_ratios = plane.inverse_ratios(splat, origin, row);
+                    let extra = state.plane_values(splat, &plane, &inverse_ratios, row);
+                    let weights =
+                        state.add_row::<ONLY_COLORS>(splat, paint, &extra, origin, row, (&mut moments, &mut values));
+                    state.add_plane_row((splat, &plane), &inverse_ratios, &weights, origin, row, &mut plane_moments);
+                } else {
+                    const NONE: Lanes = [0.0; LANES];
+                    state.add_row::<ONLY_COLORS>(splat, paint, &NONE, origin, row, (&mut moments, &mut values));
+                }
             }
             if PLANES > 0 {
                 plane_out[index] = sums_of_lanes(&plane_moments);
@@ -158,29 +166,28 @@ impl<const ONLY_COLORS: bool, const PLANES: usize> pulp::NullaryFnOnce for TileB
     }
 }
 
-/// Sums of a splat in a tile, by lane: moments and carried values ([`PairSum`]), and those of its plane ([`PlaneSum`]).
-type LaneSums<'a> = (&'a mut [Lanes; LANES], &'a mut [Lanes; 3], &'a mut [Lanes; LANES]);
-
 impl<const PLANES: usize> State<PLANES> {
-    /// Adds a splat's contribution in a row to its sums.
+    /// Adds a splat's contribution in a row to its sums and returns its weights. `extra` is the value of its plane.
     #[inline(always)]
     fn add_row<const ONLY_COLORS: bool>(
         &mut self,
-        (splat, paint, plane): (&ProjectedSplat, &[f32; 4], &Plane),
+        splat: &ProjectedSplat,
+        paint: &[f32; 4],
+        extra: &Lanes,
         origin: [f32; 2],
         row: usize,
-        (moments, values, plane_moments): LaneSums<'_>,
-    ) {
+        (moments, values): (&mut [Lanes; LANES], &mut [Lanes; 3]),
+    ) -> Lanes {
         let exponents = exponents(splat, origin, row);
         let (opaque, most) = (OPAQUE as f32, MAX_ALPHA as f32);
         let mut touched = 0u32;
+        let mut weights = [0.0; LANES];
         for lane in 0..LANES {
             touched |= u32::from(exponents[lane] >= LOG2_CUT) & u32::from(self.transmittance[row][lane] >= opaque);
         }
         if touched == 0 {
-            return;
+            return weights;
         }
-        let inverse_ratios = if PLANES > 0 { plane.inverse_ratios(splat, origin, row) } else { [1.0; LANES] };
         let dy = origin[1] + row as f32 - splat.pixel.y;
         for lane in 0..LANES {
             let dx = origin[0] + lane as f32 - splat.pixel.x;
@@ -198,29 +205,8 @@ impl<const PLANES: usize> State<PLANES> {
                 moments[3][lane] += weight * by_depth;
             }
             if PLANES > 0 {
-                let [nx, ny, nz, by_depth, mean] = [0, 1, 2, 3, 4].map(|k| self.planes[k % PLANES.max(1)][row][lane]);
-                let inverse_ratio = inverse_ratios[lane];
-                let ratio = 1.0 / plane.limit(inverse_ratio);
-                let [x, y, z] = plane.normal;
-                value += nx * x + ny * y + nz * z + by_depth * (splat.depth * ratio - mean);
-                let is_near = inverse_ratio >= plane.most;
-                let is_far = inverse_ratio.is_nan() | (inverse_ratio <= plane.least);
-                let by_ratio = weight * by_depth * splat.depth;
-                // dL/dt, and dL/d reach where t is limited.
-                let by_inverse = if is_near | is_far { 0.0 } else { -by_ratio * ratio * ratio };
-                let by_far = if is_far { by_ratio } else { 0.0 };
-                let by_reach = if is_near { -by_ratio } else { by_far };
-                let terms = [
-                    weight * nx,
-                    weight * ny,
-                    weight * nz,
-                    weight * by_depth * ratio,
-                    by_inverse,
-                    by_inverse * dx,
-                    by_inverse * dy,
-                    by_reach,
-                ];
-                plane_moments.iter_mut().zip(terms).for_each(|(sum, term)| sum[lane] += term);
+                value += extra[lane];
+                weights[lane] = weight;
             }
             let behind = self.behind[row][lane] - weight * value;
             self.behind[row][lane] = behind;
@@ -239,6 +225,62 @@ impl<const PLANES: usize> State<PLANES> {
                 values[lane] += weight * if ONLY_COLORS { color[c] } else { self.carried[c][row][lane] };
             }
             self.transmittance[row][lane] = transmittance * (1.0 - alpha);
+        }
+        weights
+    }
+
+    /// Returns the inputs of a row's pixels, as in [`Self::planes`]; zeros where there are none.
+    #[inline(always)]
+    fn plane_inputs(&self, row: usize) -> [Lanes; PLANE_INPUTS] {
+        let mut inputs = [[0.0; LANES]; PLANE_INPUTS];
+        inputs.iter_mut().zip(&self.planes).for_each(|(input, lanes)| *input = lanes[row]);
+        inputs
+    }
+
+    /// Computes the change of the linearised loss per weight of a plane at the pixels of a row.
+    #[inline(always)]
+    fn plane_values(&self, splat: &ProjectedSplat, plane: &Plane, inverse_ratios: &Lanes, row: usize) -> Lanes {
+        let [nx, ny, nz, by_depth, mean] = self.plane_inputs(row);
+        let [x, y, z] = plane.normal;
+        let mut values = [0.0; LANES];
+        for lane in 0..LANES {
+            let depth = splat.depth / plane.limit(inverse_ratios[lane]);
+            values[lane] = nx[lane] * x + ny[lane] * y + nz[lane] * z + by_depth[lane] * (depth - mean[lane]);
+        }
+        values
+    }
+
+    /// Adds a plane's contribution in a row to its sums ([`PlaneSum`]).
+    #[inline(always)]
+    fn add_plane_row(
+        &self,
+        (splat, plane): (&ProjectedSplat, &Plane),
+        inverse_ratios: &Lanes,
+        weights: &Lanes,
+        origin: [f32; 2],
+        row: usize,
+        sums: &mut [Lanes; LANES],
+    ) {
+        let [nx, ny, nz, by_depth, _] = self.plane_inputs(row);
+        let dy = origin[1] + row as f32 - splat.pixel.y;
+        for lane in 0..LANES {
+            let dx = origin[0] + lane as f32 - splat.pixel.x;
+            let (weight, inverse_ratio) = (weights[lane], inverse_ratios[lane]);
+            let ratio = 1.0 / plane.limit(inverse_ratio);
+            let is_near = inverse_ratio >= plane.most;
+            let is_inside = (inverse_ratio > plane.least) & (inverse_ratio < plane.most);
+            let by_ratio = weight * by_depth[lane] * splat.depth;
+            // dL/dt, and dL/d reach where t is limited.
+            let by_inverse = if is_inside { -by_ratio * ratio * ratio } else { 0.0 };
+            let limited = if is_near { -by_ratio } else { by_ratio };
+            sums[0][lane] += weight * nx[lane];
+            sums[1][lane] += weight * ny[lane];
+            sums[2][lane] += weight * nz[lane];
+            sums[3][lane] += weight * by_depth[lane] * ratio;
+            sums[4][lane] += by_inverse;
+            sums[5][lane] += by_inverse * dx;
+            sums[6][lane] += by_inverse * dy;
+            sums[7][lane] += if is_inside { 0.0 } else { limited };
         }
     }
 }
