@@ -88,6 +88,8 @@ pub struct RenderTarget {
     ///   linearised at the Gaussian's centre, as the projection of its ellipse is: exact for lenses without distortion.
     ///   The depth stays within three standard deviations of the Gaussian along z, and within 0.9 of its depth, about
     ///   the depth of its centre. No point of the plane within three standard deviations of the centre is beyond.
+    ///
+    /// A plane closer to edge-on than 0.6 degrees has the depths of one at this angle.
     pub planes: Option<StorageBuffer<[f32; 4]>>,
 }
 

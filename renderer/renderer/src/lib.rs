@@ -5,7 +5,8 @@
 //! copies and clears through [`StorageBuffer`](flyrig_gpu::StorageBuffer) and never through its raw buffer. Tests run both against one f64
 //! reference.
 //!
-//! - `raster`, `backward`, `anisotropic`: the rasteriser, its derivative, and Gaussians of three scales with colours by direction.
+//! - `raster`, `backward`, `anisotropic`: the rasteriser, its derivative, and Gaussians of three scales with colours by direction, their
+//!   normals and the depths on their planes.
 //! - `sort`: radix sort and prefix sum on the device.
 //! - `appearance`: colours from the images of an instant. `image_loss`: comparison of images for the deformation.
 //! - `files`: PLY files. `browser_kernels`: the WGSL for pages with WebGPU.

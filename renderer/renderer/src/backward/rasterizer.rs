@@ -74,9 +74,12 @@ impl BackwardRasterizer {
 
     /// Records the derivatives of an image of anisotropic Gaussians, as [`Self::encode`] does of isotropic ones.
     /// Records nothing for an image of isotropic Gaussians or of another order. Pixels carry only their dL/d colour: of
-    /// [`ImageGradients::depth_carry`] only x is used, and nothing where [`ImageGradients::planes`] counts. Its derivatives are
-    /// complete but for the limits of the planes' depths: they follow the standard deviation, and nothing follows where it
-    /// is limited itself.
+    /// [`ImageGradients::depth_carry`] only x is used, and nothing where [`ImageGradients::planes`] counts.
+    ///
+    /// Derivatives by planes reach centre, rotation and scales directly, and all attributes through the blending weights. Where
+    /// a depth is limited to three standard deviations ([`RenderTarget::planes`]) it follows the deviation in place of the
+    /// plane. Nothing flows through the limit of 0.9 of the depth, the least angle of a plane to the line of sight (0.6
+    /// degrees), and the choice of the smallest axis and of its sign.
     ///
     /// # Errors
     /// [`BackwardError`]; nothing is recorded then.
