@@ -29,8 +29,6 @@ pub struct MeshOptions<'a> {
     pub settings: Option<FusionSettings>,
     /// Space that is known to be empty.
     pub empty: Option<Empty<'a>>,
-    /// Whether points that no virtual camera sees are fused too.
-    pub keep_hidden: bool,
     /// Number of bodies to keep; 0 counts as 1.
     pub bodies: usize,
 }
@@ -40,8 +38,6 @@ pub struct MeshOptions<'a> {
 pub struct MeshSeconds {
     /// Density of the points and settings.
     pub density: f64,
-    /// Search for points that can be seen.
-    pub visibility: f64,
     /// Fusion of points into distances.
     pub fuse: f64,
     /// Signs of voxels without evidence.
@@ -87,8 +83,7 @@ pub struct MeshReport {
 
 /// Reconstructs a closed, 2-manifold mesh from oriented points in metres: fusion into signed distances ([`fuse`]), signs
 /// where evidence lacks ([`close`]), cut of empty space ([`carve`]), extraction ([`marching_cubes`]), removal of floaters
-/// ([`keep_largest`]). Points far from all others, and those
-/// inside that no virtual camera sees, are dropped first. Equal input gives equal bytes for any number of threads,
+/// ([`keep_largest`]). Points far from all others are dropped first. Equal input gives equal bytes for any number of threads,
 /// except for the seconds in the report.
 ///
 /// # Errors
@@ -101,11 +96,7 @@ pub fn mesh_from_points(mut points: OrientedPoints, options: &MeshOptions) -> Re
         return Err(MeshError::TooFewPoints { count: points.len(), needed: MIN_POINTS });
     }
     let mut seconds = MeshSeconds::default();
-    let mut density = timed(&mut seconds.density, || Density::measure(&points))?;
-    if !options.keep_hidden {
-        timed(&mut seconds.visibility, || points.drop_hidden(density.spacing_m()));
-        density = timed(&mut seconds.density, || Density::measure(&points))?;
-    }
+    let density = timed(&mut seconds.density, || Density::measure(&points))?;
     let derived = || {
         let settings = FusionSettings::from_density(&points, &density);
         options.voxel_m.map_or(settings, |voxel_m| settings.with_voxel(voxel_m))
@@ -138,6 +129,6 @@ pub fn mesh_from_points(mut points: OrientedPoints, options: &MeshOptions) -> Re
 fn timed<T>(seconds: &mut f64, stage: impl FnOnce() -> T) -> T {
     let start = Instant::now();
     let result = stage();
-    *seconds += start.elapsed().as_secs_f64();
+    *seconds = start.elapsed().as_secs_f64();
     result
 }

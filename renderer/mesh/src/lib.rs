@@ -57,7 +57,6 @@ mod signs;
 mod skin;
 mod topology;
 mod union_find;
-mod visible;
 mod winding;
 
 pub use atlas::{AtlasError, AtlasSettings, MeshAtlas, mesh_atlas};
@@ -84,5 +83,4 @@ pub use settings::{Fusion, FusionSettings};
 pub use signs::close;
 pub use skin::{SkinReport, SkinSettings, skin_weights};
 pub use topology::Topology;
-pub use visible::visible;
 pub use winding::Winding;

@@ -2,8 +2,6 @@
 
 use glam::Vec3;
 
-use crate::visible::visible;
-
 /// One surface point before validation.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct OrientedPoint {
@@ -17,7 +15,7 @@ pub struct OrientedPoint {
     pub uncertainty_m: f32,
 }
 
-/// Numbers of rows dropped by [`OrientedPoints::from_rows`], [`OrientedPoints::drop_distant`] and [`OrientedPoints::drop_hidden`].
+/// Numbers of rows dropped by [`OrientedPoints::from_rows`] and [`OrientedPoints::drop_distant`].
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]
 pub struct Dropped {
     /// Rows with a value that is not finite, or a negative uncertainty.
@@ -28,15 +26,13 @@ pub struct Dropped {
     pub no_weight: usize,
     /// Rows far from all others.
     pub distant: usize,
-    /// Rows inside, which no virtual camera sees.
-    pub hidden: usize,
 }
 
 impl Dropped {
     /// Returns the number of dropped rows.
     #[must_use]
     pub fn total(&self) -> usize {
-        self.not_finite + self.no_normal + self.no_weight + self.distant + self.hidden
+        self.not_finite + self.no_normal + self.no_weight + self.distant
     }
 }
 
@@ -117,12 +113,6 @@ impl OrientedPoints {
         self.dropped.distant += self.keep(&keep);
     }
 
-    /// Drops the points that no virtual camera sees ([`crate::visible`]); `spacing_m` is the spacing of the points.
-    pub fn drop_hidden(&mut self, spacing_m: f32) {
-        let seen = visible(self, spacing_m);
-        self.dropped.hidden += self.keep(&seen);
-    }
-
     /// Drops the points that are not to be kept, and returns their number.
     fn keep(&mut self, keep: &[bool]) -> usize {
         retain(&mut self.positions, keep);
@@ -200,7 +190,7 @@ mod tests {
         ];
         let points = OrientedPoints::from_rows(rows);
         assert_eq!(points.normals(), [Vec3::X, Vec3::Y]);
-        assert_eq!(points.dropped(), Dropped { not_finite: 4, no_normal: 1, no_weight: 2, distant: 0, hidden: 0 });
+        assert_eq!(points.dropped(), Dropped { not_finite: 4, no_normal: 1, no_weight: 2, distant: 0 });
         assert_eq!(points.dropped().total() + points.len(), rows.len());
     }
 

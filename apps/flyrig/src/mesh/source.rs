@@ -12,7 +12,7 @@ use flyrig_report::{progress_bar, stop};
 use flyrig_takes::AvatarTake;
 use glam::{DQuat, DVec3};
 
-use super::MeshArgs;
+use super::arguments::MeshArgs;
 use crate::avatar::{load, open_replay};
 
 /// Avatar, and the frames of its take.

@@ -13,7 +13,7 @@ use flyrig_types::PoseTrack;
 use glam::{DMat4, Quat, Vec3};
 use serde_json::json;
 
-use super::{MeshArgs, source::Source};
+use super::{arguments::MeshArgs, source::Source};
 
 /// Frames from one written surface to the next, as `flyrig eval` writes them.
 const SURFACE_EVERY: u64 = 10;
@@ -165,7 +165,6 @@ impl MeshFolder<'_> {
             "take": self.args.take.dataset.display().to_string(),
             "gaussians": mesh.points,
             "dropped": mesh.dropped.total(),
-            "hidden": mesh.dropped.hidden,
             "vertices": topology.vertices,
             "triangles": topology.triangles,
             "closed_manifold": topology.is_closed_manifold(),
@@ -190,7 +189,6 @@ impl MeshFolder<'_> {
                 "tracking": self.source.tracked_s,
                 "fit": self.source.fitted_s,
                 "density": seconds.density,
-                "visibility": seconds.visibility,
                 "fusion": seconds.fuse,
                 "signs": seconds.signs,
                 "surface": seconds.surface,

@@ -39,7 +39,7 @@ fn the_mesh_is_closed_and_lies_on_the_surface_that_the_gaussians_draw() {
     let mean = off.iter().sum::<f32>() / off.len() as f32;
     // The points of the truth are 7 mm apart: half of that is their own share.
     assert!(mean < 5e-3, "{mean}");
-    assert!(report.skin.taken > mesh.positions.len() * 9 / 10, "{:?}", report.skin);
+    assert!(report.skin.inpainted + report.skin.isolated < report.skin.taken / 10, "{:?}", report.skin);
 }
 
 #[test]
@@ -54,7 +54,7 @@ fn poses_and_nodes_move_the_mesh_as_they_move_the_body() {
     let mut pose = skeleton.rest_pose();
     pose.root_translation = DVec3::new(0.4, 0.1, -0.2);
     pose.joint_rotations[0] *= DQuat::from_rotation_y(0.5);
-    let arm = (0..skeleton.joints().len()).find(|joint| skeleton.joints()[*joint].name.contains("arm")).unwrap();
+    let arm = skeleton.joint("LeftForeArm").unwrap();
     pose.joint_rotations[arm] *= DQuat::from_rotation_z(0.7);
     let nodes = avatar.hanging.as_ref().unwrap().nodes.len();
     let translations = vec![DVec3::new(0.0, 0.0, 0.03); nodes];

@@ -1,0 +1,59 @@
+//! Arguments of `flyrig mesh`.
+
+use std::path::PathBuf;
+
+use clap::{Args, ValueEnum};
+
+use crate::arguments::DatasetArgs;
+
+/// Default number of Gaussians, as a rig draws.
+const GAUSSIANS: u32 = 115_000;
+/// Default steps of the fit.
+const STEPS: u64 = 400;
+
+/// Arguments of `flyrig mesh`.
+#[derive(Debug, Clone, Args)]
+pub struct MeshArgs {
+    #[command(flatten)]
+    pub take: DatasetArgs,
+    /// Folder of the mesh; it must be new or empty.
+    #[arg(long)]
+    pub out: PathBuf,
+    /// Gaussians on the person's surface while a take is tracked and fitted.
+    #[arg(long, default_value_t = GAUSSIANS, value_parser = clap::value_parser!(u32).range(1000..=1_000_000))]
+    pub gaussians: u32,
+    /// Steps in which the Gaussians are fitted to all images of a take; 0 meshes the tracked surface.
+    #[arg(long, default_value_t = STEPS, value_parser = clap::value_parser!(u64).range(0..=1_000_000))]
+    pub steps: u64,
+    /// Fusion of the Gaussians' surfaces into one.
+    #[arg(long, value_enum, default_value = "hgm")]
+    pub fusion: FusionKind,
+    /// Side of a voxel, millimetres; twice the distance of neighbouring Gaussians if not given.
+    #[arg(long, value_parser = parse_voxel)]
+    pub voxel: Option<f32>,
+    /// Triangles of the mesh, at most.
+    #[arg(long, default_value_t = 60_000, value_parser = clap::value_parser!(u32).range(500..=5_000_000))]
+    pub triangles: u32,
+    /// Texels along a side of the texture.
+    #[arg(long, default_value_t = 2048, value_parser = clap::value_parser!(u32).range(64..=4096))]
+    pub texture: u32,
+    /// Write the surface of every frame of a take, in place of every tenth, and of all frames as one USD file.
+    #[arg(long)]
+    pub sequence: bool,
+}
+
+/// Fusion of oriented points.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, ValueEnum)]
+pub enum FusionKind {
+    /// Weights that fall with the distance, of points that face the same way (HGM, Eq. 18).
+    Hgm,
+    /// Equal weights of all points within the truncation distance.
+    Naive,
+}
+
+fn parse_voxel(text: &str) -> Result<f32, String> {
+    match text.parse::<f32>() {
+        Ok(side) if (1.0..=50.0).contains(&side) => Ok(side / 1000.0),
+        _ => Err(format!("'{text}' is not between 1 and 50 millimetres")),
+    }
+}
