@@ -9,7 +9,7 @@ use flyrig_tests::{run, write_dataset};
 
 const PROGRAM: &str = env!("CARGO_BIN_EXE_flyrig-under-test");
 const GIVEN: [&str; 4] = ["--pose", "given", "--masks", "given"];
-const SMALL: [&str; 6] = ["--triangles", "4000", "--texture", "64", "--voxel", "20"];
+const SMALL: [&str; 6] = ["--triangles", "4000", "--texture", "512", "--voxel", "20"];
 
 fn number(metrics: &serde_json::Value, name: &str) -> f64 {
     metrics[name].as_f64().unwrap_or_else(|| panic!("no {name} in {metrics}"))

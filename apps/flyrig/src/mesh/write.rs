@@ -70,7 +70,7 @@ impl MeshFolder<'_> {
             self.write_sequence(&folder.join("sequence.usda"), &file)?;
         }
         self.write_surfaces(folder)?;
-        Ok(write_whole(&folder.join("metrics.json"), &serde_json::to_vec_pretty(&self.metrics())?)?)
+        write_whole(&folder.join("metrics.json"), &serde_json::to_vec_pretty(&self.metrics())?)
     }
 
     /// Writes mesh, bones and motion as USDZ.

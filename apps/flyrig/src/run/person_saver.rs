@@ -33,7 +33,7 @@ impl PersonSaver {
 
     /// Returns whether the person is to be saved now. Reports a file that could not be written.
     pub fn is_due(&mut self) -> bool {
-        if self.writing.as_ref().is_some_and(|thread| thread.is_finished()) {
+        if self.writing.as_ref().is_some_and(JoinHandle::is_finished) {
             self.report_last();
         }
         self.writing.is_none() && self.started.elapsed() >= SAVE_EVERY
