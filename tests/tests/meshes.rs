@@ -45,6 +45,7 @@ fn a_take_becomes_a_closed_mesh_that_moves_as_the_person_does() {
     assert!((1.2..2.2).contains(&tall), "{tall} m, y up");
     let surfaces: Vec<_> = fs::read_dir(at("surface")).unwrap().collect();
     assert_eq!(surfaces.len(), 4);
+    assert!(at("surface/000003.ply").exists());
     for name in ["mesh.obj", "mesh.mtl", "mesh.png", "mesh.usdz", "mesh.3mf", "sequence.usda"] {
         assert!(fs::metadata(at(name)).unwrap().len() > 60, "{name}");
     }
@@ -71,6 +72,12 @@ fn a_take_becomes_a_closed_mesh_that_moves_as_the_person_does() {
     refused(&["a.flyavatar", "--out", "m"], "m exists already");
     refused(&["a.flyavatar", "--out", "none/m"], "the folder none does not exist");
     refused(&["a.flyavatar", "--out", "x", "--inputs", "00"], "is an avatar and not a take");
+    refused(&["a.flyavatar", "--out", "."], "names no folder");
+    fs::create_dir(folder.path().join("x.partial")).unwrap();
+    fs::write(folder.path().join("x.partial/mine"), b"kept").unwrap();
+    refused(&["a.flyavatar", "--out", "x"], "x.partial is left over");
+    assert!(folder.path().join("x.partial/mine").exists());
+    fs::remove_dir_all(folder.path().join("x.partial")).unwrap();
     refused(&["missing.flyavatar", "--out", "x"], "missing.flyavatar does not exist");
     fs::write(folder.path().join("broken.flyavatar"), b"nothing").unwrap();
     refused(&["broken.flyavatar", "--out", "x"], "broken.flyavatar");

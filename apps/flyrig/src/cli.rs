@@ -135,7 +135,7 @@ pub enum Command {
         #[command(subcommand)]
         action: AvatarAction,
     },
-    /// Write the person of a take, or an avatar, as a closed mesh with bones (glTF, PLY).
+    /// Write the person of a take, or an avatar, as a closed mesh with texture and bones (glTF, USDZ, OBJ, 3MF, PLY).
     Mesh(MeshArgs),
     /// Print the default configuration of the simulated rig, or export a simulated capture.
     Sim {

@@ -13,7 +13,7 @@ use flyrig_mesh::{Fusion, MeshOptions, MeshedPerson, PersonOptions};
 use arguments::FusionKind;
 pub use arguments::MeshArgs;
 use source::Source;
-use write::MeshFolder;
+use write::{MeshFolder, partial_of};
 
 /// Runs the command.
 pub fn mesh(args: &MeshArgs, gpu: &dyn Fn() -> Result<GpuContext>) -> Result<()> {
@@ -35,11 +35,23 @@ pub fn mesh(args: &MeshArgs, gpu: &dyn Fn() -> Result<GpuContext>) -> Result<()>
     MeshFolder { out: &args.out, source: &source, person: &person, report: &report, seconds, args }.write()
 }
 
-/// Checks that the folder can be written to, before any work.
+/// Checks before any work that the folder can be written: it is new or empty, and its parent takes folders.
 fn check_target(out: &Path) -> Result<()> {
+    let partial = partial_of(out)?;
     let parent = out.parent().filter(|folder| !folder.as_os_str().is_empty()).unwrap_or(Path::new("."));
     ensure!(parent.is_dir(), "the folder {} does not exist; make it, or choose another --out", parent.display());
-    let taken = out.is_file() || std::fs::read_dir(out).is_ok_and(|mut entries| entries.next().is_some());
-    ensure!(!taken, "{} exists already; remove it, or choose another --out", out.display());
-    Ok(())
+    let is_empty = |path: &Path| std::fs::read_dir(path).is_ok_and(|mut entries| entries.next().is_none());
+    let is_free = match std::fs::symlink_metadata(out) {
+        Ok(found) => found.is_dir() && is_empty(out),
+        Err(_) => true,
+    };
+    ensure!(is_free, "{} exists already; remove it, or choose another --out", out.display());
+    ensure!(
+        std::fs::symlink_metadata(&partial).is_err(),
+        "{} is left over from a run that still goes on or was killed; remove it if none does",
+        partial.display()
+    );
+    std::fs::create_dir(&partial)
+        .and_then(|()| std::fs::remove_dir(&partial))
+        .with_context(|| format!("cannot create {}", partial.display()))
 }

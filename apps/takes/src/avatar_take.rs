@@ -22,8 +22,8 @@ pub struct AvatarTake {
     pub avatar: Avatar,
     /// Texture coordinates of its Gaussians; empty if the template has none.
     pub uvs: Vec<Vec2>,
-    /// Number of the first frame, and of the last one plus 1.
-    pub numbers: [u64; 2],
+    /// Number of each of these frames, ascending; at least one.
+    pub numbers: Vec<u64>,
     /// First camera.
     pub camera: Camera,
 }
@@ -61,7 +61,7 @@ impl AvatarTake {
         }
         bar.finish_and_clear();
         let subject = replay.session.subject(person);
-        let (Some(subject), Some(first), Some(last)) = (subject, numbers.first(), numbers.last()) else {
+        let Some(subject) = subject.filter(|_| !numbers.is_empty()) else {
             bail!("no person was found in the take; run with -v to see why");
         };
         let (surface, graph) = person_surface(subject.template(), body)?;
@@ -72,6 +72,6 @@ impl AvatarTake {
         avatar.set_mean(frames.iter().map(|frame: &TrainingFrame| frame.translations.as_slice()));
         avatar.known_poses = KnownPoses::new(&poses);
         let camera = replay.session.rig().cameras.first().cloned().context("no camera")?;
-        Ok(Self { frames, views, avatar, uvs: surface.uvs, numbers: [*first, last + 1], camera })
+        Ok(Self { frames, views, avatar, uvs: surface.uvs, numbers, camera })
     }
 }

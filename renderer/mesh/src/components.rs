@@ -43,6 +43,8 @@ pub fn keep_largest(mesh: &TriMesh, bodies: usize) -> Result<(TriMesh, Removed),
     for (row, root) in rows.iter().zip(&roots) {
         volumes[*root] += signed_volume(mesh.corners(*row));
     }
+    // A volume that is no number is that of a poisoned vertex.
+    volumes.iter_mut().filter(|volume| !volume.is_finite()).for_each(|volume| *volume = 0.0);
     let mut order: Vec<usize> = roots.clone();
     order.sort_unstable();
     order.dedup();
@@ -65,7 +67,7 @@ pub fn keep_largest(mesh: &TriMesh, bodies: usize) -> Result<(TriMesh, Removed),
     let mut renumbered = vec![u32::MAX; mesh.positions.len()];
     let mut used = vec![false; mesh.positions.len()];
     let triangles =
-        || mesh.triangles.iter().zip(&roots).filter(|(_, root)| is_kept[**root]).map(|(corners, _)| corners);
+        || rows.iter().zip(&roots).filter(|(_, root)| is_kept[**root]).map(|(row, _)| &mesh.triangles[*row]);
     triangles().flatten().for_each(|vertex| used[*vertex as usize] = true);
     for vertex in (0..used.len()).filter(|vertex| used[*vertex]) {
         renumbered[vertex] = result.positions.len() as u32;
@@ -106,8 +108,10 @@ mod tests {
         let (kept, removed) = keep_largest(&tetrahedra(&[0.3, 1.0, -0.5]), 1).unwrap();
         assert_eq!((kept.triangles.len(), kept.positions[0], kept.from_hole[0]), (4, Vec3::X * 9.0, false));
         let mut poisoned = tetrahedra(&[1.0]);
+        poisoned.triangles.insert(0, [0, 1, 99]);
         poisoned.triangles.push([0, 1, 99]);
-        assert_eq!(keep_largest(&poisoned, 1).unwrap().1.triangles, 1);
+        let (kept, removed_ones) = keep_largest(&poisoned, 1).unwrap();
+        assert_eq!((kept.triangles.len(), removed_ones.triangles), (4, 2));
         poisoned.positions[1] = Vec3::NAN;
         assert_eq!(keep_largest(&poisoned, 1).unwrap_err(), MeshError::NoSurface);
         assert_eq!((removed.volumes_m3.len(), removed.cavities(), removed.triangles), (2, 1, 8));

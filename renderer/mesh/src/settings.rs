@@ -79,7 +79,11 @@ impl FusionSettings {
             return rejected("voxel_m", self.voxel_m, "voxels have 0.0001 to 1 m");
         }
         if !(self.voxel_m * 1.8..=self.voxel_m * 32.0).contains(&self.truncation_m) {
-            return rejected("truncation_m", self.truncation_m, "the truncation distance has 1.8 to 32 voxels");
+            return rejected(
+                "truncation_m",
+                self.truncation_m,
+                "it has 1.8 to 32 voxels and at least three spacings of the points; choose larger voxels or more points",
+            );
         }
         if !(0.0..=PI).contains(&self.angle_rad) {
             return rejected("angle_rad", self.angle_rad, "angles have 0 to pi radians");

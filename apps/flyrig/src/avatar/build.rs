@@ -114,7 +114,8 @@ pub fn build(args: &AvatarBuildArgs, gpu: &GpuContext) -> Result<()> {
         preview.draw(model.avatar())?;
     }
     let fit = Fit::new(gpu, model, views, FitSettings { seed: args.seed, ..FitSettings::default() })?;
-    Building::start(args, fit, preview)?.run(numbers)
+    let range = [numbers.first(), numbers.last()].map(|number| number.copied().unwrap_or_default());
+    Building::start(args, fit, preview)?.run([range[0], range[1] + 1])
 }
 
 /// Writes the avatar in a file of `body.person`.

@@ -19,7 +19,7 @@ pub struct MeshArgs {
     /// Folder of the mesh; it must be new or empty.
     #[arg(long)]
     pub out: PathBuf,
-    /// Gaussians on the person's surface while a take is tracked and fitted.
+    /// Gaussians on the person's surface while a take is tracked and fitted; an avatar has its own.
     #[arg(long, default_value_t = GAUSSIANS, value_parser = clap::value_parser!(u32).range(1000..=1_000_000))]
     pub gaussians: u32,
     /// Steps in which the Gaussians are fitted to all images of a take; 0 meshes the tracked surface.
@@ -31,7 +31,7 @@ pub struct MeshArgs {
     /// Side of a voxel, millimetres; twice the distance of neighbouring Gaussians if not given.
     #[arg(long, value_parser = parse_voxel)]
     pub voxel: Option<f32>,
-    /// Triangles of the mesh, at most.
+    /// Triangles to simplify the mesh to; more remain where fewer would change its topology.
     #[arg(long, default_value_t = 60_000, value_parser = clap::value_parser!(u32).range(500..=5_000_000))]
     pub triangles: u32,
     /// Texels along a side of the texture.

@@ -20,8 +20,8 @@ pub(super) struct Source {
     pub avatar: Avatar,
     /// Frames in which the person was found; none for an avatar from a file.
     pub frames: Vec<TrainingFrame>,
-    /// Number of the first frame.
-    pub first: u64,
+    /// Number of each of these frames in the take, ascending.
+    pub numbers: Vec<u64>,
     /// Frames per second of the take.
     pub fps: f64,
     /// Upward direction of the take's world.
@@ -45,7 +45,7 @@ impl Source {
             return Ok(Self {
                 avatar,
                 frames: Vec::new(),
-                first: 0,
+                numbers: Vec::new(),
                 fps: 30.0,
                 up: DVec3::Z,
                 tracked_s: 0.0,
@@ -60,6 +60,11 @@ impl Source {
         DQuat::from_rotation_arc(self.up.normalize_or(DVec3::Z), DVec3::Y)
     }
 
+    /// Returns the time of each frame, seconds from the first one.
+    pub fn seconds(&self) -> impl Iterator<Item = f64> + '_ {
+        seconds_of(&self.numbers, self.fps)
+    }
+
     fn track(args: &MeshArgs, gpu: &GpuContext) -> Result<Self> {
         let started = Instant::now();
         let take_args = args.take.resolve("mesh", &[], gpu)?;
@@ -72,6 +77,7 @@ impl Source {
         println!("tracked {} frames in {tracked_s:.0} s", frames.len());
         let up = replay.session.rig().world_up;
         drop(replay);
+        ensure!(!stop::requested(), "stopped; nothing was written");
         let started = Instant::now();
         let avatar = if args.steps == 0 {
             avatar
@@ -88,6 +94,25 @@ impl Source {
             fit.into_model().into_avatar()
         };
         let fitted_s = started.elapsed().as_secs_f64();
-        Ok(Self { avatar, frames, first: numbers[0], fps: take_args.rate.fps, up, tracked_s, fitted_s })
+        Ok(Self { avatar, frames, numbers, fps: take_args.rate.fps, up, tracked_s, fitted_s })
+    }
+}
+
+/// Returns the times of frames by their ascending numbers, seconds from the first one.
+fn seconds_of(numbers: &[u64], fps: f64) -> impl Iterator<Item = f64> + '_ {
+    let first = numbers.first().copied().unwrap_or_default();
+    numbers.iter().map(move |number| number.saturating_sub(first) as f64 / fps)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn frames_without_a_person_leave_gaps_in_time() {
+        let close =
+            |found: Vec<f64>, expected: [f64; 3]| found.iter().zip(expected).all(|(a, b)| (a - b).abs() < 1e-12);
+        assert!(close(seconds_of(&[3, 4, 7], 10.0).collect(), [0.0, 0.1, 0.4]));
+        assert_eq!(seconds_of(&[], 10.0).count(), 0);
     }
 }

@@ -1,14 +1,14 @@
 //! Files of a meshed person.
 
-use std::path::Path;
+use std::path::{Path, PathBuf};
 
-use anyhow::{Context as _, Result};
+use anyhow::{Context as _, Result, ensure};
 use flyrig_body::{GlbContents, write_glb, write_mesh_ply};
 use flyrig_mesh::{
     JointFrame, MeshFile, MeshFrame, MeshJoint, MeshSkeleton, MeshedPerson, PersonReport, write_3mf, write_obj,
     write_usd_sequence, write_usdz,
 };
-use flyrig_report::{png, write_whole};
+use flyrig_report::{png, stop, write_whole};
 use flyrig_types::PoseTrack;
 use glam::{DMat4, Quat, Vec3};
 use serde_json::json;
@@ -17,6 +17,17 @@ use super::{arguments::MeshArgs, source::Source};
 
 /// Frames from one written surface to the next, as `flyrig eval` writes them.
 const SURFACE_EVERY: u64 = 10;
+
+/// Returns the folder beside the target that is written first.
+///
+/// # Errors
+/// The target has no name, as `.` has none.
+pub(super) fn partial_of(out: &Path) -> Result<PathBuf> {
+    let name = out.file_name().with_context(|| format!("{} names no folder; choose another --out", out.display()))?;
+    let mut partial = name.to_owned();
+    partial.push(".partial");
+    Ok(out.with_file_name(partial))
+}
 
 /// Folder that is written.
 pub(super) struct MeshFolder<'a> {
@@ -32,25 +43,24 @@ pub(super) struct MeshFolder<'a> {
 impl MeshFolder<'_> {
     /// Writes all files to a folder beside the target, which appears whole or not at all.
     pub fn write(&self) -> Result<()> {
-        let mut name = self.out.file_name().context("--out names no folder")?.to_owned();
-        name.push(".partial");
-        let partial = self.out.with_file_name(name);
-        let written = self.write_to(&partial).and_then(|()| {
-            // An empty folder of this name may be there.
-            let _ = std::fs::remove_dir(self.out);
-            std::fs::rename(&partial, self.out).with_context(|| format!("cannot write {}", self.out.display()))
-        });
-        if written.is_err() {
+        ensure!(!stop::requested(), "stopped; nothing was written");
+        let partial = partial_of(self.out)?;
+        std::fs::create_dir(&partial).with_context(|| format!("cannot create {}", partial.display()))?;
+        if let Err(error) = self.write_to(&partial) {
             // The first error is the one worth reporting.
             let _ = std::fs::remove_dir_all(&partial);
+            return Err(error);
         }
-        written?;
+        // An empty folder of this name may be there.
+        let _ = std::fs::remove_dir(self.out);
+        std::fs::rename(&partial, self.out).with_context(|| {
+            format!("cannot rename {} to {}; the mesh is in the former", partial.display(), self.out.display())
+        })?;
         self.print();
         Ok(())
     }
 
     fn write_to(&self, folder: &Path) -> Result<()> {
-        std::fs::create_dir_all(folder).with_context(|| format!("cannot create {}", folder.display()))?;
         let (track, template) = (self.track()?, &self.person.template);
         let texture = png::encode_rgb(&self.person.texture.rgb, self.person.texture.side, self.person.texture.side)?;
         let contents = GlbContents { track: track.as_ref(), texture: Some(&texture) };
@@ -121,23 +131,22 @@ impl MeshFolder<'_> {
             .collect();
         let frames: Vec<MeshFrame<'_>> = posed
             .iter()
-            .enumerate()
-            .map(|(i, (positions, normals))| MeshFrame { secs: i as f64 / self.source.fps, positions, normals })
+            .zip(self.source.seconds())
+            .map(|((positions, normals), secs)| MeshFrame { secs, positions, normals })
             .collect();
         Ok(write_usd_sequence(path, file, &frames)?)
     }
 
     /// Returns the tracked motion with y up.
     fn track(&self) -> Result<Option<PoseTrack>> {
-        let step = 1e9 / self.source.fps;
         let turn = self.source.y_up();
-        let keys = self.source.frames.iter().enumerate().map(|(i, frame)| {
+        let keys = self.source.frames.iter().zip(self.source.seconds()).map(|(frame, secs)| {
             let mut pose = frame.pose.clone();
             pose.root_translation = turn * pose.root_translation;
             if let Some(root) = pose.joint_rotations.first_mut() {
                 *root = (turn * *root).normalize();
             }
-            ((i as f64 * step) as i64, pose)
+            ((secs * 1e9) as i64, pose)
         });
         let keys: Vec<_> = keys.collect();
         Ok(if keys.is_empty() { None } else { Some(PoseTrack::new(keys)?) })
@@ -146,9 +155,11 @@ impl MeshFolder<'_> {
     /// Writes the surface of the frames, in the take's own axes.
     fn write_surfaces(&self, folder: &Path) -> Result<()> {
         let every = if self.args.sequence { 1 } else { SURFACE_EVERY };
-        let numbers = self.source.first..;
-        let chosen = numbers.zip(&self.source.frames).filter(|(number, _)| number.is_multiple_of(every));
-        std::fs::create_dir_all(folder.join("surface"))?;
+        let numbers = self.source.numbers.iter().zip(&self.source.frames);
+        let chosen: Vec<_> = numbers.filter(|(number, _)| number.is_multiple_of(every)).collect();
+        if !chosen.is_empty() {
+            std::fs::create_dir(folder.join("surface"))?;
+        }
         for (number, frame) in chosen {
             let (positions, normals) = self.person.posed(&frame.pose, Some(&frame.translations));
             let path = folder.join(format!("surface/{number:06}.ply"));

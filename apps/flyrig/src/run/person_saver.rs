@@ -74,7 +74,7 @@ impl PersonSaver {
     fn report(&mut self, error: &anyhow::Error) {
         self.failures += 1;
         if self.failures.is_power_of_two() {
-            tracing::warn!(times = self.failures, "{error:#}; the rig goes on and tries again in a minute");
+            tracing::warn!(times = self.failures, "{error:#}; the file before stays as it is");
         }
     }
 }

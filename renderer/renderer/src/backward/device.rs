@@ -267,7 +267,7 @@ impl DeviceBackward {
         let most = limits.max_buffer_size.min(limits.max_storage_buffer_binding_size)
             / (vectors as u64 * kernels::VECTOR_BYTES);
         let wanted = u64::from(pairs).min(most) as usize;
-        if self.pairs < wanted || self.pair_sums.len() < vectors * wanted {
+        if self.pairs < wanted || self.pair_sums.len() < vectors * self.pairs.max(wanted) {
             self.pair_sums = StorageBuffer::zeroed(gpu, "sums of pairs", vectors * wanted)?;
             self.room = StorageBuffer::from_slice(gpu, "room for sums of pairs", &[[wanted as u32, 0, 0, 0]])?;
             self.pairs = wanted;
