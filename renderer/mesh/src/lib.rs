@@ -56,6 +56,7 @@ mod shapes;
 mod signs;
 mod skin;
 mod topology;
+mod triangle;
 mod union_find;
 mod winding;
 

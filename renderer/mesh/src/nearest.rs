@@ -3,6 +3,7 @@
 use glam::Vec3;
 
 use crate::TriMesh;
+use crate::triangle::closest_on_triangle;
 
 /// Triangles of a leaf, at most.
 const LEAF: usize = 4;
@@ -67,7 +68,9 @@ impl Surface {
             }
             let node = &self.nodes[i];
             for triangle in &self.triangles[node.range.clone()] {
-                best = best.min(point.distance_squared(nearest_on(triangle, point)));
+                let weights = closest_on_triangle(point, *triangle);
+                let nearest: Vec3 = triangle.iter().zip(weights).map(|(corner, weight)| *corner * weight).sum();
+                best = best.min(point.distance_squared(nearest));
             }
             if node.range.is_empty() {
                 let mut children = [i + 1, node.second].map(|child| (to_box(child), child));
@@ -79,35 +82,6 @@ impl Surface {
         }
         best.sqrt()
     }
-}
-
-/// Returns the point of a triangle nearest to `p` (Ericson, Real-Time Collision Detection, section 5.1.5).
-fn nearest_on(&[a, b, c]: &[Vec3; 3], p: Vec3) -> Vec3 {
-    let (ab, ac) = (b - a, c - a);
-    let (d1, d2) = (ab.dot(p - a), ac.dot(p - a));
-    if d1 <= 0.0 && d2 <= 0.0 {
-        return a;
-    }
-    let (d3, d4) = (ab.dot(p - b), ac.dot(p - b));
-    if d3 >= 0.0 && d4 <= d3 {
-        return b;
-    }
-    let (d5, d6) = (ab.dot(p - c), ac.dot(p - c));
-    if d6 >= 0.0 && d5 <= d6 {
-        return c;
-    }
-    let (va, vb, vc) = (d3 * d6 - d5 * d4, d5 * d2 - d1 * d6, d1 * d4 - d3 * d2);
-    if vc <= 0.0 && d1 >= 0.0 && d3 <= 0.0 {
-        return a + ab * (d1 / (d1 - d3));
-    }
-    if vb <= 0.0 && d2 >= 0.0 && d6 <= 0.0 {
-        return a + ac * (d2 / (d2 - d6));
-    }
-    if va <= 0.0 && d4 >= d3 && d5 >= d6 {
-        return b + (c - b) * ((d4 - d3) / ((d4 - d3) + (d5 - d6)));
-    }
-    let sum = va + vb + vc;
-    a + ab * (vb / sum) + ac * (vc / sum)
 }
 
 #[cfg(test)]

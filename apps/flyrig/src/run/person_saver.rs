@@ -1,4 +1,4 @@
-//! File of the learnt person, written in a thread of its own: encoding takes a tenth of a second, and a disk may take longer.
+//! File of the learnt person, written in a thread of its own: a slow disk holds up no frame set.
 
 use std::{
     path::{Path, PathBuf},

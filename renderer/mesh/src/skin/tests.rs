@@ -1,7 +1,8 @@
 use flyrig_body::{ShapeParams, default_template};
 use glam::{DVec3, Vec3};
 
-use super::{closest::closest_on_triangle, inpaint::inpaint, laplacian::Laplacian, *};
+use super::{inpaint::inpaint, laplacian::Laplacian, *};
+use crate::triangle::closest_on_triangle;
 
 /// Square sheet of `side` x `side` vertices, 1 cm apart, in the plane z = 0.
 fn sheet(side: usize) -> (Vec<Vec3>, Vec<[u32; 3]>) {
