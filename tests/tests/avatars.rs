@@ -95,8 +95,10 @@ fn an_avatar_is_built_scored_driven_and_exported() {
     let height = done(&["edit", "a.flyavatar", "--shape", "height=0.7", "--out", "tall.flyavatar"]);
     let heights: Vec<f64> = height.split_whitespace().filter_map(|word| word.parse().ok()).take(2).collect();
     assert!(heights[1] > heights[0] + 0.05, "{height}");
-    done(&["export", "tall.flyavatar", "--out", "tall.glb", "--mesh", "--motion", &motion, "--side", "128"]);
-    done(&["render", "a.flyavatar", "--motion", "tall.glb", "--out", "t", "--frames", "0..1", "--size", "64x96"]);
+    let mesh = ["mesh", "tall.flyavatar", "--out", "tall", "--motion", &motion, "--texture", "128", "--voxel", "20"];
+    let meshed = run(PROGRAM, &mesh, folder.path()).unwrap();
+    assert_eq!(meshed.code, Some(0), "{meshed:?}");
+    done(&["render", "a.flyavatar", "--motion", "tall/mesh.glb", "--out", "t", "--frames", "0..1", "--size", "64x96"]);
     assert!(done(&["export", "a.flyavatar", "--out", "a.glb"]).contains("4000 splats"));
 
     // Unsupported inputs.
@@ -113,7 +115,6 @@ fn an_avatar_is_built_scored_driven_and_exported() {
     );
     refused(&["edit", "a.flyavatar", "--shape", "hight=1", "--out", "no.flyavatar"], "did you mean height");
     refused(&["edit", "a.flyavatar", "--out", "no.flyavatar"], "nothing to edit");
-    refused(&["export", "a.flyavatar", "--out", "a.ply", "--mesh"], "name the file a.glb");
     refused(&["export", "a.flyavatar", "--out", "a.obj"], "a.obj is neither");
     assert!(!folder.path().join("no.flyavatar").exists());
     refused(&["info", "nowhere.flyavatar"], "nowhere.flyavatar does not exist; `flyrig avatar build` makes an avatar");

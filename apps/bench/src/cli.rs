@@ -16,6 +16,7 @@ use crate::{
     },
     scale::BenchScaleArgs,
     stream::{arguments::BenchStreamArgs, receive::BenchReceiveArgs},
+    surfaces::BenchSurfacesArgs,
     watch::BenchWatchArgs,
 };
 
@@ -65,6 +66,8 @@ pub enum BenchCommand {
     Subjects(BenchSubjectsArgs),
     /// Identities: takes of several people who walk past one another, found and followed from images alone.
     Takes(BenchTakesArgs),
+    /// Meshes: their distance from the true surfaces of takes, over what they are made from, and the run time. Writes a table and JSON.
+    Surfaces(BenchSurfacesArgs),
     /// Run time and error over pixels, input cameras and Gaussians, and the exponents of the run time.
     Scale(BenchScaleArgs),
     /// Recordings of uncompressed cameras: bytes, processor time and loss of each JPEG quality.

@@ -11,6 +11,7 @@ mod people;
 mod perception;
 mod scale;
 mod stream;
+mod surfaces;
 mod watch;
 
 use std::process::ExitCode;
@@ -51,6 +52,7 @@ fn dispatch(cli: &BenchCli) -> Result<()> {
         BenchCommand::Watch(args) => watch::watch(args, &gpu()?),
         BenchCommand::Masks(args) => perception::masks::masks(args),
         BenchCommand::Perception(args) => perception::perception(args, &gpu()?),
+        BenchCommand::Surfaces(args) => surfaces::surfaces(args, &gpu()?),
         BenchCommand::Scale(args) => scale::scale(args, &gpu()?),
         BenchCommand::Takes(args) => people::takes::takes(args, &gpu()?),
         BenchCommand::Subjects(args) => people::subjects::subjects(args, &gpu()?),

@@ -18,7 +18,10 @@ use anyhow::Result;
 use clap::Subcommand;
 use flyrig_gpu::GpuContext;
 
-pub(crate) use self::inputs::{load, open_replay};
+pub(crate) use self::{
+    inputs::{load, open_replay},
+    motion::DrivenMotion,
+};
 
 /// Subcommands of `flyrig avatar`.
 #[derive(Debug, Subcommand)]
@@ -32,7 +35,7 @@ pub enum AvatarAction {
     Render(render::AvatarRenderArgs),
     /// Change the colours of an avatar by a painted texture, or its shape.
     Edit(edit::AvatarEditArgs),
-    /// Write an avatar for other programs: splats in a pose (PLY, glTF), a textured mesh with bones (glTF), the texture (PNG).
+    /// Write an avatar for other programs: splats in a pose (PLY, glTF), the texture (PNG). `flyrig mesh` writes meshes.
     Export(export::AvatarExportArgs),
     /// Print the provenance and size of an avatar.
     Info {

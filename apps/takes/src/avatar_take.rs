@@ -12,7 +12,7 @@ use glam::Vec2;
 use crate::replay::{Replay, frame_number};
 
 /// Tracked take.
-#[derive(Debug)]
+#[derive(Debug, Clone)]
 pub struct AvatarTake {
     /// Frames in which the person was found.
     pub frames: Vec<TrainingFrame>,
@@ -73,5 +73,26 @@ impl AvatarTake {
         avatar.known_poses = KnownPoses::new(&poses);
         let camera = replay.session.rig().cameras.first().cloned().context("no camera")?;
         Ok(Self { frames, views, avatar, uvs: surface.uvs, numbers, camera })
+    }
+
+    /// Returns the frame of this number alone, whose shape of clothes and hair becomes the avatar's mean.
+    ///
+    /// # Errors
+    /// The person was not found in this frame.
+    pub fn only(mut self, number: u64) -> Result<Self> {
+        let Ok(at) = self.numbers.binary_search(&number) else {
+            bail!(
+                "the person was not found in frame {number}; it was found in {} frames from {} to {}",
+                self.numbers.len(),
+                self.numbers.first().copied().unwrap_or_default(),
+                self.numbers.last().copied().unwrap_or_default()
+            );
+        };
+        self.avatar.set_mean(self.frames[at..=at].iter().map(|frame| frame.translations.as_slice()));
+        self.frames = self.frames.split_off(at);
+        self.frames.truncate(1);
+        self.views = self.views.into_iter().filter(|view| view.frame() == at).map(|view| view.of_frame(0)).collect();
+        self.numbers = vec![number];
+        Ok(self)
     }
 }

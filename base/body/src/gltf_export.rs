@@ -12,8 +12,10 @@ use crate::{BodyError, GlbWriter, Template};
 pub struct GlbContents<'a> {
     /// Motion, written as one animation with the track's times and world axes.
     pub track: Option<&'a PoseTrack>,
-    /// Texture as a PNG file; the material is unlit.
+    /// Texture as a PNG file.
     pub texture: Option<&'a [u8]>,
+    /// Whether other programs light the texture; otherwise it contains the lighting.
+    pub is_lit: bool,
 }
 
 /// Writes a skinned mesh atomically, in the form that [`crate::load_gltf`] reads.
@@ -73,14 +75,16 @@ pub fn write_glb(path: &Path, template: &Template, contents: GlbContents<'_>) ->
     if let Some(png) = contents.texture {
         primitive["material"] = json!(0);
         let view = glb.bytes(png);
-        // The photographed texture already contains the lighting.
-        document["extensionsUsed"] = json!(["KHR_materials_unlit"]);
         document["images"] = json!([{ "bufferView": view, "mimeType": "image/png" }]);
         document["textures"] = json!([{ "source": 0 }]);
-        document["materials"] = json!([{
+        let mut material = json!({
             "pbrMetallicRoughness": { "baseColorTexture": { "index": 0 }, "metallicFactor": 0.0, "roughnessFactor": 1.0 },
-            "extensions": { "KHR_materials_unlit": {} },
-        }]);
+        });
+        if !contents.is_lit {
+            document["extensionsUsed"] = json!(["KHR_materials_unlit"]);
+            material["extensions"] = json!({ "KHR_materials_unlit": {} });
+        }
+        document["materials"] = json!([material]);
     }
     document["meshes"] = json!([{ "primitives": [primitive] }]);
     glb.write(path, document)

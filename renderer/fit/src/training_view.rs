@@ -62,6 +62,12 @@ impl TrainingView {
         Some(Self { frame, camera, rgba: cut.into(), mixed: mixed.into() })
     }
 
+    /// Returns the number of its frame among those of the fit.
+    #[must_use]
+    pub fn frame(&self) -> usize {
+        self.frame
+    }
+
     /// Returns the same image as one of another frame.
     #[must_use]
     pub fn of_frame(self, frame: usize) -> Self {

@@ -14,6 +14,8 @@ const REACH_CELLS: i32 = 8;
 #[derive(Debug, Clone)]
 pub struct Points {
     pub points: Vec<Vec3>,
+    /// Unit normal of each point's triangle; zero for a triangle without area.
+    pub normals: Vec<Vec3>,
     cells: HashMap<IVec3, Vec<u32>>,
 }
 
@@ -28,10 +30,11 @@ impl Points {
         let area = |[a, b, c]: [Vec3; 3]| 0.5 * f64::from((b - a).cross(c - a).length());
         let corners: Vec<[Vec3; 3]> = triangles.iter().filter_map(corners).collect();
         let total: f64 = corners.iter().map(|&t| area(t)).sum();
-        let mut points = Vec::with_capacity(count);
+        let (mut points, mut normals) = (Vec::with_capacity(count), Vec::with_capacity(count));
         let (mut sum, mut done) = (0.0, 0usize);
         for &[a, b, c] in &corners {
             sum += area([a, b, c]);
+            let normal = (b - a).cross(c - a).normalize_or_zero();
             let upto = (sum / total.max(1e-12) * count as f64).floor() as usize;
             for k in done..upto.min(count) {
                 // The plastic number's recurrence covers the square evenly.
@@ -40,6 +43,7 @@ impl Points {
                     (u, v) = (1.0 - u, 1.0 - v);
                 }
                 points.push(a + (b - a) * u as f32 + (c - a) * v as f32);
+                normals.push(normal);
             }
             done = done.max(upto.min(count));
         }
@@ -47,16 +51,21 @@ impl Points {
         for (i, point) in (0u32..).zip(&points) {
             cells.entry(cell(*point)).or_default().push(i);
         }
-        Self { points, cells }
+        Self { points, normals, cells }
     }
 
     /// Returns the distance to the nearest point, metres.
     pub fn distance(&self, from: Vec3) -> f64 {
+        f64::from(self.nearest(from).1)
+    }
+
+    /// Returns the nearest point and the distance to it, metres; no point and the bound of distances where none is that near.
+    pub fn nearest(&self, from: Vec3) -> (Option<usize>, f32) {
         let home = cell(from);
-        let mut best = f32::INFINITY;
+        let mut best = (None, REACH_CELLS as f32 * CELL_M);
         for ring in 0..=REACH_CELLS {
             // What lies in farther cells is at least so far away.
-            if best <= (ring - 1) as f32 * CELL_M {
+            if best.1 <= (ring - 1) as f32 * CELL_M {
                 break;
             }
             for z in -ring..=ring {
@@ -65,14 +74,17 @@ impl Points {
                     let mut x = -ring;
                     while x <= ring {
                         for &i in self.cells.get(&(home + IVec3::new(x, y, z))).map_or(&[][..], Vec::as_slice) {
-                            best = best.min(self.points[i as usize].distance(from));
+                            let distance = self.points[i as usize].distance(from);
+                            if distance < best.1 {
+                                best = (Some(i as usize), distance);
+                            }
                         }
                         x += if edge || ring == 0 { 1 } else { 2 * ring };
                     }
                 }
             }
         }
-        f64::from(best.min(REACH_CELLS as f32 * CELL_M))
+        best
     }
 
     /// Returns the mean distance of `others` to these points, metres; 0 without others.
@@ -106,6 +118,9 @@ mod tests {
             assert!((points.distance(from) - f64::from(plain)).abs() < 1e-6, "{from}");
         }
         assert!((points.distance(Vec3::splat(9.0)) - 0.16).abs() < 1e-6, "far is far");
+        assert_eq!(points.nearest(Vec3::splat(9.0)).0, None);
+        assert!(points.normals.iter().all(|normal| *normal == Vec3::Z));
+        assert_eq!(points.nearest(points.points[77] + Vec3::Z * 1e-4).0, Some(77));
         let lifted: Vec<Vec3> = points.points.iter().map(|p| *p + Vec3::Z * 0.01).collect();
         assert!((points.mean_distance(&lifted) - 0.01).abs() < 1e-4);
         assert!(Points::on(&[], &[], 10).points.is_empty());

@@ -5,11 +5,9 @@ use std::path::{Path, PathBuf};
 use anyhow::{Context as _, Result, bail, ensure};
 use clap::Args;
 use flyrig_avatar::{Atlas, Avatar, Bones, DEFAULT_ATLAS_SIDE, PosedAvatar, write_splat_glb};
-use flyrig_body::{GlbContents, write_glb};
 use flyrig_renderer::{AnisotropicSplats, write_anisotropic_ply};
 use flyrig_report::{png, write_whole};
-use flyrig_types::PoseTrack;
-use glam::{DQuat, Quat};
+use glam::Quat;
 
 use super::{inputs::load, motion::DrivenMotion};
 
@@ -21,9 +19,6 @@ pub struct AvatarExportArgs {
     /// The file to write: splats as *.ply, or as *.glb (KHR_gaussian_splatting); the texture as *.png.
     #[arg(long)]
     pub out: PathBuf,
-    /// Write a textured mesh of the clothed surface with bones (*.glb) instead of splats, animated by --motion.
-    #[arg(long)]
-    pub mesh: bool,
     /// Motion that poses it (BVH or glTF, or the name of a generated one); the rest pose otherwise.
     #[arg(long)]
     pub motion: Option<PathBuf>,
@@ -46,14 +41,8 @@ pub struct TextureArgs {
 pub fn export(args: &AvatarExportArgs) -> Result<()> {
     let avatar = load(&args.avatar)?;
     let ending = args.out.extension().map(|ending| ending.to_string_lossy().to_lowercase()).unwrap_or_default();
-    ensure!(
-        !args.mesh || ending == "glb",
-        "--mesh writes glTF; name the file {}",
-        args.out.with_extension("glb").display()
-    );
     match ending.as_str() {
         "png" => texture(&avatar, args),
-        "glb" if args.mesh => mesh(&avatar, args),
         "ply" | "glb" => splats(&avatar, args, &ending),
         _ => bail!("{} is neither *.ply, *.glb nor *.png", args.out.display()),
     }
@@ -74,32 +63,6 @@ fn texture(avatar: &Avatar, args: &AvatarExportArgs) -> Result<()> {
 
 fn encode(atlas: &Atlas) -> Result<Vec<u8>> {
     png::encode_rgb(&atlas.rgb, atlas.side, atlas.side)
-}
-
-fn mesh(avatar: &Avatar, args: &AvatarExportArgs) -> Result<()> {
-    let texture = encode(&avatar.atlas(args.resolution.side)?)?;
-    let mut surface = avatar.surface();
-    let motion = args.motion.as_deref().map(|motion| DrivenMotion::load(&surface, motion)).transpose()?;
-    let track = motion.map(|motion| y_up(motion.track())).transpose()?;
-    surface.normals = avatar.template.normals_at(&surface.positions);
-    write_glb(&args.out, &surface, GlbContents { track: track.as_ref(), texture: Some(&texture) })?;
-    let (vertices, joints) = (surface.positions.len(), surface.skeleton.joints().len());
-    println!("textured mesh of {vertices} vertices with {joints} joints in {}", args.out.display());
-    Ok(())
-}
-
-/// Rotates a motion from z up to glTF's y up.
-fn y_up(track: &PoseTrack) -> Result<PoseTrack> {
-    let turn = DQuat::from_rotation_x(-std::f64::consts::FRAC_PI_2);
-    let turned = track.keys().iter().map(|(nanos, pose)| {
-        let mut pose = pose.clone();
-        pose.root_translation = turn * pose.root_translation;
-        if let Some(root) = pose.joint_rotations.first_mut() {
-            *root = (turn * *root).normalize();
-        }
-        (*nanos, pose)
-    });
-    Ok(PoseTrack::new(turned.collect())?)
 }
 
 fn splats(avatar: &Avatar, args: &AvatarExportArgs, ending: &str) -> Result<()> {
@@ -141,47 +104,4 @@ pub(super) fn read_texture(path: &Path, side: u32) -> Result<Atlas> {
         path.display()
     );
     Ok(Atlas { side, rgb: image.into_raw(), covered: 0 })
-}
-
-#[cfg(test)]
-mod tests {
-    use flyrig_body::{
-        DEFAULT_SIGMA2_M2, ShapeParams, build_graph, default_template, load_gltf, sample_surface, skin_mesh,
-    };
-    use flyrig_renderer::HarmonicOrder;
-    use glam::DVec3;
-
-    use super::*;
-
-    #[test]
-    fn the_mesh_is_the_clothed_surface() {
-        let folder = tempfile::tempdir().unwrap();
-        let [avatar_path, out] = ["a.flyavatar", "a.glb"].map(|name| folder.path().join(name));
-        let template = default_template(&ShapeParams::default()).unwrap();
-        let gaussians = sample_surface(&template, 2000, 5).unwrap();
-        let graph = build_graph(&template, &gaussians, 60, DEFAULT_SIGMA2_M2).unwrap();
-        let mut avatar = Avatar::new(&template, &gaussians, Some(&graph), &[], HarmonicOrder::Zero).unwrap();
-        // Clothes that stand off by 5 cm to the front.
-        for mean in &mut avatar.hanging.as_mut().unwrap().mean {
-            *mean = DVec3::Z * 0.05;
-        }
-        write_whole(&avatar_path, &avatar.to_bytes().unwrap()).unwrap();
-        export(&AvatarExportArgs {
-            avatar: avatar_path,
-            out: out.clone(),
-            mesh: true,
-            motion: None,
-            frame: 0,
-            resolution: TextureArgs { side: 32 },
-        })
-        .unwrap();
-        let written = load_gltf(&out).unwrap().template;
-        let at_rest = |template: &flyrig_body::Template| skin_mesh(template, &template.skeleton.rest_pose()).0;
-        for ((clothed, found), body) in
-            at_rest(&avatar.surface()).iter().zip(at_rest(&written)).zip(at_rest(&avatar.template))
-        {
-            assert!(clothed.distance(found) < 1e-4, "{found} is not {clothed}");
-            assert!((found - body).z > 0.04, "{found} lies on the body, {body}");
-        }
-    }
 }

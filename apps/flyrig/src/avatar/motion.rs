@@ -12,7 +12,7 @@ pub(super) const FPS: f64 = 30.0;
 
 /// Motion of an avatar: z up, the floor at z = 0, the middle of its path at the origin.
 #[derive(Debug)]
-pub(super) struct DrivenMotion {
+pub(crate) struct DrivenMotion {
     /// File or name, for messages.
     what: String,
     track: PoseTrack,

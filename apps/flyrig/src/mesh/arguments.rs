@@ -19,6 +19,12 @@ pub struct MeshArgs {
     /// Folder of the mesh; it must be new or empty.
     #[arg(long)]
     pub out: PathBuf,
+    /// Mesh what the cameras show in this one frame of a take, in place of all of them.
+    #[arg(long, conflicts_with = "sequence")]
+    pub frame: Option<u64>,
+    /// Motion of an avatar's mesh (BVH or glTF, or the name of a generated one); that of a take is the tracked one.
+    #[arg(long)]
+    pub motion: Option<PathBuf>,
     /// Gaussians on the person's surface while a take is tracked and fitted; an avatar has its own.
     #[arg(long, default_value_t = GAUSSIANS, value_parser = clap::value_parser!(u32).range(1000..=1_000_000))]
     pub gaussians: u32,

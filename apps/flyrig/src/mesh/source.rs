@@ -10,10 +10,11 @@ use flyrig_gpu::GpuContext;
 use flyrig_renderer::HarmonicOrder;
 use flyrig_report::{progress_bar, stop};
 use flyrig_takes::AvatarTake;
+use flyrig_types::PoseTrack;
 use glam::{DQuat, DVec3};
 
 use super::arguments::MeshArgs;
-use crate::avatar::{load, open_replay};
+use crate::avatar::{DrivenMotion, load, open_replay};
 
 /// Avatar, and the frames of its take.
 pub(super) struct Source {
@@ -24,7 +25,9 @@ pub(super) struct Source {
     pub numbers: Vec<u64>,
     /// Frames per second of the take.
     pub fps: f64,
-    /// Upward direction of the take's world.
+    /// Motion of an avatar, z up.
+    pub motion: Option<PoseTrack>,
+    /// Upward direction of the take's or the motion's world.
     pub up: DVec3,
     /// Seconds of tracking and of the fit.
     pub tracked_s: f64,
@@ -37,13 +40,19 @@ impl Source {
         let path = &args.take.dataset;
         if path.extension().is_some_and(|extension| extension == "flyavatar" || extension == "person") {
             ensure!(
-                args.take.inputs.is_empty() && !args.sequence,
-                "{} is an avatar and not a take: leave out --inputs and --sequence",
+                args.take.inputs.is_empty()
+                    && args.take.range.frames.is_none()
+                    && args.frame.is_none()
+                    && !args.sequence,
+                "{} is an avatar and not a take: leave out --inputs, --frames, --frame and --sequence",
                 path.display()
             );
             let avatar = load(path)?;
+            let motion =
+                args.motion.as_deref().map(|motion| DrivenMotion::load(&avatar.surface(), motion)).transpose()?;
             return Ok(Self {
                 avatar,
+                motion: motion.map(|motion| motion.track().clone()),
                 frames: Vec::new(),
                 numbers: Vec::new(),
                 fps: 30.0,
@@ -52,6 +61,11 @@ impl Source {
                 fitted_s: 0.0,
             });
         }
+        ensure!(
+            args.motion.is_none(),
+            "--motion moves an avatar, and {} is a take, whose mesh moves as the person did: leave out --motion, or build an avatar first",
+            path.display()
+        );
         Self::track(args, &gpu()?.fastest())
     }
 
@@ -67,11 +81,21 @@ impl Source {
 
     fn track(args: &MeshArgs, gpu: &GpuContext) -> Result<Self> {
         let started = Instant::now();
-        let take_args = args.take.resolve("mesh", &[], gpu)?;
+        let mut take_args = args.take.resolve("mesh", &[], gpu)?;
+        if let Some(frame) = args.frame {
+            // What comes after it changes nothing.
+            let range = take_args.range.frames.clone().unwrap_or(0..u64::MAX);
+            ensure!(range.contains(&frame), "--frame {frame} is not among --frames {}..{}", range.start, range.end);
+            take_args.range.frames = Some(range.start..frame + 1);
+        }
         let body = BodySettings { gaussians: args.gaussians as usize, ..BodySettings::default() };
         let mut replay = open_replay(&take_args, &[], (&body, None), gpu)?;
         let take = AvatarTake::track(&mut replay, &body, HarmonicOrder::Zero, |_, _| Ok(()))
             .with_context(|| format!("no mesh of {}", take_args.dataset.display()))?;
+        let take = match args.frame {
+            Some(frame) => take.only(frame)?,
+            None => take,
+        };
         let AvatarTake { frames, views, avatar, numbers, .. } = take;
         let tracked_s = started.elapsed().as_secs_f64();
         println!("tracked {} frames in {tracked_s:.0} s", frames.len());
@@ -94,7 +118,7 @@ impl Source {
             fit.into_model().into_avatar()
         };
         let fitted_s = started.elapsed().as_secs_f64();
-        Ok(Self { avatar, frames, numbers, fps: take_args.rate.fps, up, tracked_s, fitted_s })
+        Ok(Self { avatar, frames, motion: None, numbers, fps: take_args.rate.fps, up, tracked_s, fitted_s })
     }
 }
 

@@ -63,7 +63,7 @@ impl MeshFolder<'_> {
     fn write_to(&self, folder: &Path) -> Result<()> {
         let (track, template) = (self.track()?, &self.person.template);
         let texture = png::encode_rgb(&self.person.texture.rgb, self.person.texture.side, self.person.texture.side)?;
-        let contents = GlbContents { track: track.as_ref(), texture: Some(&texture) };
+        let contents = GlbContents { track: track.as_ref(), texture: Some(&texture), is_lit: true };
         write_glb(&folder.join("mesh.glb"), template, contents)?;
         let file = MeshFile {
             positions: &template.positions,
@@ -137,24 +137,26 @@ impl MeshFolder<'_> {
         Ok(write_usd_sequence(path, file, &frames)?)
     }
 
-    /// Returns the tracked motion with y up.
+    /// Returns the tracked motion, or that of an avatar, with y up.
     fn track(&self) -> Result<Option<PoseTrack>> {
         let turn = self.source.y_up();
-        let keys = self.source.frames.iter().zip(self.source.seconds()).map(|(frame, secs)| {
-            let mut pose = frame.pose.clone();
+        let tracked = self.source.frames.iter().zip(self.source.seconds());
+        let tracked = tracked.map(|(frame, secs)| ((secs * 1e9) as i64, frame.pose.clone()));
+        let given = self.source.motion.iter().flat_map(|track| track.keys().iter().cloned());
+        let turned = tracked.chain(given).map(|(nanos, mut pose)| {
             pose.root_translation = turn * pose.root_translation;
             if let Some(root) = pose.joint_rotations.first_mut() {
                 *root = (turn * *root).normalize();
             }
-            ((secs * 1e9) as i64, pose)
+            (nanos, pose)
         });
-        let keys: Vec<_> = keys.collect();
+        let keys: Vec<_> = turned.collect();
         Ok(if keys.is_empty() { None } else { Some(PoseTrack::new(keys)?) })
     }
 
     /// Writes the surface of the frames, in the take's own axes.
     fn write_surfaces(&self, folder: &Path) -> Result<()> {
-        let every = if self.args.sequence { 1 } else { SURFACE_EVERY };
+        let every = if self.args.sequence || self.args.frame.is_some() { 1 } else { SURFACE_EVERY };
         let numbers = self.source.numbers.iter().zip(&self.source.frames);
         let chosen: Vec<_> = numbers.filter(|(number, _)| number.is_multiple_of(every)).collect();
         if !chosen.is_empty() {
