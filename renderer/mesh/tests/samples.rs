@@ -82,18 +82,14 @@ fn write_all(folder: &Path, name: &str, mesh: &TriMesh, target: usize) -> String
     let rigged = folder.join(format!("{name}-rigged.usdz"));
     write_usdz(&rigged, &MeshFile { skeleton: Some(skeleton), ..file }).unwrap();
 
-    let moved: Vec<Vec<Vec3>> = (0..20)
-        .map(|i| {
-            let turned = middle * Mat4::from_quat(turn(i)) * middle.inverse();
-            positions.iter().map(|p| p.lerp(turned.transform_point3(*p), share(p))).collect()
-        })
-        .collect();
-    let frames: Vec<MeshFrame<'_>> = (0u32..)
-        .zip(&moved)
-        .map(|(i, positions)| MeshFrame { secs: f64::from(i) / 25.0, positions, normals: &normals })
-        .collect();
-    write_usd_sequence(&path("usda"), &file, &frames).unwrap();
-    let last: Vec2 = moved[19].iter().fold(Vec2::new(f32::MAX, f32::MIN), |y, p| Vec2::new(y.x.min(p.y), y.y.max(p.y)));
+    let moved = |i: usize| -> Vec<Vec3> {
+        let turned = middle * Mat4::from_quat(turn(i)) * middle.inverse();
+        positions.iter().map(|p| p.lerp(turned.transform_point3(*p), share(p))).collect()
+    };
+    let secs: Vec<f64> = (0u32..20).map(|i| f64::from(i) / 25.0).collect();
+    let frame = |i: usize| Ok(MeshFrame { positions: moved(i), normals: normals.clone() });
+    write_usd_sequence(&path("usda"), &file, &secs, frame).unwrap();
+    let last: Vec2 = moved(19).iter().fold(Vec2::new(f32::MAX, f32::MIN), |y, p| Vec2::new(y.x.min(p.y), y.y.max(p.y)));
     format!(
         r#"  "{name}": {{"triangles": {}, "height_m": {}, "last_height_m": {}, "genus": {}}}"#,
         atlas.triangles.len(),

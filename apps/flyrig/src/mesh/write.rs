@@ -76,10 +76,7 @@ impl MeshFolder<'_> {
         write_obj(&folder.join("mesh.obj"), &file)?;
         self.write_rigged(&folder.join("mesh.usdz"), &file, track.as_ref())?;
         write_3mf(&folder.join("mesh.3mf"), &file)?;
-        if self.args.sequence {
-            self.write_sequence(&folder.join("sequence.usda"), &file)?;
-        }
-        self.write_surfaces(folder)?;
+        self.write_frames(folder, &file)?;
         write_whole(&folder.join("metrics.json"), &serde_json::to_vec_pretty(&self.metrics())?)
     }
 
@@ -116,27 +113,6 @@ impl MeshFolder<'_> {
         Ok(write_usdz(path, &MeshFile { skeleton: Some(skeleton), ..*file })?)
     }
 
-    /// Writes the surface of all frames as one USD stage, y up.
-    fn write_sequence(&self, path: &Path, file: &MeshFile<'_>) -> Result<()> {
-        let turn = self.source.y_up().as_quat();
-        let posed: Vec<(Vec<Vec3>, Vec<Vec3>)> = self
-            .source
-            .frames
-            .iter()
-            .map(|frame| {
-                let (mut positions, mut normals) = self.person.posed(&frame.pose, Some(&frame.translations));
-                positions.iter_mut().chain(&mut normals).for_each(|vector| *vector = turn * *vector);
-                (positions, normals)
-            })
-            .collect();
-        let frames: Vec<MeshFrame<'_>> = posed
-            .iter()
-            .zip(self.source.seconds())
-            .map(|((positions, normals), secs)| MeshFrame { secs, positions, normals })
-            .collect();
-        Ok(write_usd_sequence(path, file, &frames)?)
-    }
-
     /// Returns the tracked motion, or that of an avatar, with y up.
     fn track(&self) -> Result<Option<PoseTrack>> {
         let turn = self.source.y_up();
@@ -154,20 +130,32 @@ impl MeshFolder<'_> {
         Ok(if keys.is_empty() { None } else { Some(PoseTrack::new(keys)?) })
     }
 
-    /// Writes the surface of the frames, in the take's own axes.
-    fn write_surfaces(&self, folder: &Path) -> Result<()> {
-        let every = if self.args.sequence || self.args.frame.is_some() { 1 } else { SURFACE_EVERY };
-        let numbers = self.source.numbers.iter().zip(&self.source.frames);
-        let chosen: Vec<_> = numbers.filter(|(number, _)| number.is_multiple_of(every)).collect();
-        if !chosen.is_empty() {
+    /// Writes the surfaces of the frames: as PLY in the take's own axes, every tenth or, as a sequence, all, which become one USD stage
+    /// with y up as well. Each frame is posed once.
+    fn write_frames(&self, folder: &Path, file: &MeshFile<'_>) -> Result<()> {
+        let is_written = |number: u64| self.args.sequence || self.args.frame.is_some() || number.is_multiple_of(SURFACE_EVERY);
+        if self.source.numbers.iter().any(|number| is_written(*number)) {
             std::fs::create_dir(folder.join("surface"))?;
         }
-        for (number, frame) in chosen {
-            let (positions, normals) = self.person.posed(&frame.pose, Some(&frame.translations));
-            let path = folder.join(format!("surface/{number:06}.ply"));
-            write_mesh_ply(&path, &positions, &normals, &self.person.template.triangles, &[])?;
+        if self.args.sequence {
+            let (secs, turn): (Vec<f64>, _) = (self.source.seconds().collect(), self.source.y_up().as_quat());
+            return Ok(write_usd_sequence(&folder.join("sequence.usda"), file, &secs, |i| {
+                let mut frame = self.write_surface(folder, i).map_err(std::io::Error::other)?;
+                frame.positions.iter_mut().chain(&mut frame.normals).for_each(|vector| *vector = turn * *vector);
+                Ok(frame)
+            })?);
         }
-        Ok(())
+        let chosen = (0..self.source.frames.len()).filter(|i| is_written(self.source.numbers[*i]));
+        chosen.map(|i| self.write_surface(folder, i)).try_for_each(|written| written.map(drop))
+    }
+
+    /// Writes and returns the surface of one frame, in the take's own axes.
+    fn write_surface(&self, folder: &Path, at: usize) -> Result<MeshFrame> {
+        let (number, frame) = (self.source.numbers[at], &self.source.frames[at]);
+        let (positions, normals) = self.person.posed(&frame.pose, Some(&frame.translations));
+        let path = folder.join(format!("surface/{number:06}.ply"));
+        write_mesh_ply(&path, &positions, &normals, &self.person.template.triangles, &[])?;
+        Ok(MeshFrame { positions, normals })
     }
 
     fn metrics(&self) -> serde_json::Value {

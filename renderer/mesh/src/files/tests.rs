@@ -141,25 +141,30 @@ fn sequences_have_points_by_time() {
     let path = folder.path().join("dance.usda");
     let sample = Sample::new();
     let moved: Vec<Vec3> = sample.positions.iter().map(|p| p + Vec3::Y).collect();
-    let frame = |secs, positions| MeshFrame { secs, positions, normals: &sample.normals };
-    let frames = [frame(0.0, &sample.positions[..]), frame(0.25, &moved[..])];
-    write_usd_sequence(&path, &sample.mesh(), &frames).unwrap();
+    let frame = |positions: &[Vec3]| MeshFrame { positions: positions.to_vec(), normals: sample.normals.clone() };
+    let frames = [frame(&sample.positions), frame(&moved)];
+    let write = |path: &Path, secs: &[f64], frames: &[MeshFrame]| {
+        write_usd_sequence(path, &sample.mesh(), secs, |i| Ok(frames[i].clone()))
+    };
+    write(&path, &[0.0, 0.25], &frames).unwrap();
     let stage = fs::read_to_string(&path).unwrap();
     assert!(stage.contains("timeCodesPerSecond = 4") && stage.contains("endTimeCode = 1\n"));
     assert!(stage.contains("1: [(0, 1, 0), (1, 1, 0),") && stage.contains("@./dance.png@"));
     assert!(stage.contains("1: [(0, 1, 0), (1, 2, 1)],"), "the extent moves");
     assert!(folder.path().join("dance.png").exists());
-    let refused = |frames: &[MeshFrame<'_>]| {
-        write_usd_sequence(&folder.path().join("no.usda"), &sample.mesh(), frames).unwrap_err().to_string()
-    };
-    assert!(refused(&[]).ends_with("no.usda: not written, the sequence has no frames"));
-    assert!(refused(&[frames[1], frames[0]]).contains("the frame at 0 s does not follow the one at 0.25 s"));
-    assert!(refused(&[MeshFrame { secs: f64::NAN, ..frames[0] }]).contains("NaN"));
-    assert!(
-        refused(&[MeshFrame { positions: &moved[1..], ..frames[0] }]).contains("has 4 positions and 5 normals of 5")
-    );
-    let poisoned = [&[Vec3::NAN], &moved[1..]].concat();
-    assert!(refused(&[MeshFrame { normals: &poisoned, ..frames[0] }]).contains("vertex 0 of the frame at 0 s"));
+    assert_eq!(stage.matches('{').count(), stage.matches('}').count());
+    let normals = stage.split("normals.timeSamples").nth(1).unwrap();
+    assert_eq!(normals.split('}').next().unwrap().matches(": [(").count(), 2, "{normals}");
+    let no = folder.path().join("no.usda");
+    let refused = |secs: &[f64], frames: &[MeshFrame]| write(&no, secs, frames).unwrap_err().to_string();
+    assert!(refused(&[], &[]).ends_with("no.usda: not written, the sequence has no frames"));
+    assert!(refused(&[0.25, 0.0], &frames).contains("the frame at 0 s does not follow the one at 0.25 s"));
+    assert!(refused(&[f64::NAN], &frames).contains("NaN"));
+    assert!(refused(&[0.0], &[frame(&moved[1..])]).contains("has 4 positions and 5 normals of 5"));
+    let poisoned = MeshFrame { normals: [&[Vec3::NAN], &moved[1..]].concat(), ..frames[0].clone() };
+    assert!(refused(&[0.0, 1.0], &[frames[0].clone(), poisoned]).contains("vertex 0 of the frame at 1 s"));
+    let failed = write_usd_sequence(&no, &sample.mesh(), &[0.0], |_| Err(std::io::Error::other("no disk")));
+    assert!(failed.unwrap_err().to_string().ends_with("no.usda: not written, no disk"));
     assert_eq!(fs::read_dir(folder.path()).unwrap().count(), 2, "nothing of a refused sequence stays");
 }
 
@@ -175,8 +180,8 @@ fn faulty_meshes_are_refused_and_leave_nothing() {
             Some("3mf") => write_3mf(&path, mesh),
             Some("usdz") => write_usdz(&path, mesh),
             _ => {
-                let frame = MeshFrame { secs: 0.0, positions: mesh.positions, normals: mesh.normals };
-                write_usd_sequence(&path, mesh, &[frame])
+                let frame = MeshFrame { positions: mesh.positions.to_vec(), normals: mesh.normals.to_vec() };
+                write_usd_sequence(&path, mesh, &[0.0], |_| Ok(frame.clone()))
             }
         };
         result.unwrap_err().to_string()

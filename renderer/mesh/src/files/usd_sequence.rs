@@ -1,6 +1,7 @@
 //! USD stage of a mesh that moves: one topology, points by time.
 
-use std::io::{self, Write};
+use std::fs;
+use std::io::{self, BufWriter, Write};
 use std::path::Path;
 
 use flyrig_types::write_whole;
@@ -10,105 +11,128 @@ use super::mesh_file::{MeshFile, MeshFileError, beside, refused, system, times_p
 use super::usd_text::{Times, write_extent, write_header, write_material, write_mesh_opening, write_vectors};
 
 /// Vertices of a moving mesh at a time.
-#[derive(Debug, Clone, Copy)]
-pub struct MeshFrame<'a> {
-    /// Time, seconds.
-    pub secs: f64,
+#[derive(Debug, Clone)]
+pub struct MeshFrame {
     /// Vertex positions, metres, y up.
-    pub positions: &'a [Vec3],
+    pub positions: Vec<Vec3>,
     /// Unit normal of each vertex.
-    pub normals: &'a [Vec3],
+    pub normals: Vec<Vec3>,
 }
 
 /// Writes a moving mesh as one stage in USD's text form, metres, y up. Triangles, texture coordinates and texture are those
 /// of `mesh`, whose positions and normals are the default outside of the animation; its skeleton is left out. A texture is
 /// written beside the stage as `NAME.png`, before it.
 ///
+/// `secs` are the times of the frames, seconds, ascending. `frame` makes the frame of each time; it is called once per frame, in order,
+/// and one frame is held at a time.
+///
 /// # Errors
-/// [`MeshFileError`] for faulty content, no frames, times that do not ascend, frames that do not fit the mesh, and when the
-/// system fails.
-pub fn write_usd_sequence(path: &Path, mesh: &MeshFile<'_>, frames: &[MeshFrame<'_>]) -> Result<(), MeshFileError> {
+/// [`MeshFileError`] for faulty content, no frames, times that do not ascend, frames that do not fit the mesh, errors of `frame`, and when
+/// the system fails.
+pub fn write_usd_sequence(
+    path: &Path,
+    mesh: &MeshFile<'_>,
+    secs: &[f64],
+    frame: impl FnMut(usize) -> io::Result<MeshFrame>,
+) -> Result<(), MeshFileError> {
     let mesh = MeshFile { skeleton: None, ..*mesh };
     mesh.check(path, "usda")?;
-    if let Some(problem) = problem(frames, mesh.positions.len()) {
+    if let Some(problem) = times_problem(secs.iter().copied()) {
         return Err(refused(path, problem));
     }
-    let Some(times) = Times::new(frames.iter().map(|frame| frame.secs)) else {
+    let Some(times) = Times::new(secs.iter().copied()) else {
         return Err(refused(path, "the sequence has no frames".to_owned()));
     };
-    let texture = match mesh.texture {
-        None => None,
-        Some(png) => {
-            let (texture_path, name) = beside(path, "png")?;
-            write_whole(&texture_path, |out| out.write_all(png)).map_err(system(&texture_path))?;
-            Some(format!("./{name}"))
-        }
-    };
-    write_whole(path, |out| write_stage(out, &mesh, frames, &times, texture.as_deref())).map_err(system(path))
+    let texture =
+        mesh.texture.map(|png| beside(path, "png").map(|(path, name)| (png, path, format!("./{name}")))).transpose()?;
+    // Text of normals, which follow the points of all frames.
+    let (normals, _) = beside(path, "normals.partial")?;
+    let mut frames = Frames { mesh: &mesh, secs, times: &times, frame, problem: None };
+    let mut failed = None;
+    let written = write_whole(path, |out| {
+        frames.write_stage(out, &normals, texture.as_ref().map(|(_, _, name)| name.as_str()))?;
+        let Some((png, path, _)) = &texture else { return Ok(()) };
+        write_whole(path, |out| out.write_all(png)).inspect_err(|_| failed = Some(path.clone()))
+    });
+    // It exists only if the stage was begun.
+    let _ = fs::remove_file(&normals);
+    match frames.problem {
+        Some(problem) => Err(refused(path, problem)),
+        None => written.map_err(system(failed.as_deref().unwrap_or(path))),
+    }
 }
 
-fn problem(frames: &[MeshFrame<'_>], vertices: usize) -> Option<String> {
-    for frame in frames {
-        let (secs, positions, normals) = (frame.secs, frame.positions.len(), frame.normals.len());
-        if (positions, normals) != (vertices, vertices) {
-            return Some(format!(
-                "the frame at {secs} s has {positions} positions and {normals} normals of {vertices}"
-            ));
-        }
-        if let Some(vertex) =
-            frame.positions.iter().zip(frame.normals).position(|(p, n)| !p.is_finite() || !n.is_finite())
-        {
-            return Some(format!("vertex {vertex} of the frame at {secs} s is not a finite number"));
-        }
-    }
-    times_problem(frames.iter().map(|frame| frame.secs))
+/// Frames on their way into a stage.
+struct Frames<'a, F> {
+    mesh: &'a MeshFile<'a>,
+    secs: &'a [f64],
+    times: &'a Times,
+    frame: F,
+    /// Fault of a frame.
+    problem: Option<String>,
 }
 
-fn write_stage(
-    out: &mut impl Write,
-    mesh: &MeshFile<'_>,
-    frames: &[MeshFrame<'_>],
-    times: &Times,
-    texture: Option<&str>,
-) -> io::Result<()> {
-    write_header(out, Some(times))?;
-    write!(out, "def Xform \"Root\" (\n    kind = \"component\"\n)\n{{\n")?;
-    write_mesh_opening(out, mesh)?;
-    write!(out, "        float3[] extent = ")?;
-    write_extent(out, mesh.positions)?;
-    write!(out, "\n        float3[] extent.timeSamples = {{\n")?;
-    for frame in frames {
-        write!(out, "            {}: ", times.code(frame.secs))?;
-        write_extent(out, frame.positions)?;
-        writeln!(out, ",")?;
+impl<F: FnMut(usize) -> io::Result<MeshFrame>> Frames<'_, F> {
+    fn write_stage(&mut self, out: &mut impl Write, normals: &Path, texture: Option<&str>) -> io::Result<()> {
+        write_header(out, Some(self.times))?;
+        write!(out, "def Xform \"Root\" (\n    kind = \"component\"\n)\n{{\n")?;
+        write_mesh_opening(out, self.mesh)?;
+        let extents = self.write_points(out, normals)?;
+        write!(out, "        normal3f[] normals = ")?;
+        write_vectors(out, self.mesh.normals)?;
+        write!(out, " (\n            interpolation = \"vertex\"\n        )")?;
+        write!(out, "\n        normal3f[] normals.timeSamples = {{\n")?;
+        io::copy(&mut fs::File::open(normals)?, out)?;
+        write!(out, "        }}\n        float3[] extent = ")?;
+        write_extent(out, self.mesh.positions)?;
+        write!(out, "\n        float3[] extent.timeSamples = {{\n")?;
+        for (secs, extent) in self.secs.iter().zip(&extents) {
+            write!(out, "            {}: ", self.times.code(*secs))?;
+            write_extent(out, extent)?;
+            writeln!(out, ",")?;
+        }
+        writeln!(out, "        }}\n    }}")?;
+        if let Some(texture) = texture {
+            write_material(out, texture)?;
+        }
+        writeln!(out, "}}")
     }
-    write!(out, "        }}\n        point3f[] points = ")?;
-    write_vectors(out, mesh.positions)?;
-    write_samples(out, "point3f[] points", frames, times, |frame| frame.positions)?;
-    write!(out, "        normal3f[] normals = ")?;
-    write_vectors(out, mesh.normals)?;
-    write!(out, " (\n            interpolation = \"vertex\"\n        )")?;
-    write_samples(out, "normal3f[] normals", frames, times, |frame| frame.normals)?;
-    writeln!(out, "    }}")?;
-    if let Some(texture) = texture {
-        write_material(out, texture)?;
+
+    /// Writes the points of all frames, and their normals to a file of their own. Returns the lowest and highest corner of each frame.
+    fn write_points(&mut self, out: &mut impl Write, normals: &Path) -> io::Result<Vec<[Vec3; 2]>> {
+        let mut of_normals = BufWriter::new(fs::File::create(normals)?);
+        let mut extents = Vec::with_capacity(self.secs.len());
+        write!(out, "        point3f[] points = ")?;
+        write_vectors(out, self.mesh.positions)?;
+        write!(out, "\n        point3f[] points.timeSamples = {{\n")?;
+        for (i, secs) in self.secs.iter().enumerate() {
+            let frame = (self.frame)(i)?;
+            self.problem = problem(&frame, *secs, self.mesh.positions.len());
+            if self.problem.is_some() {
+                return Err(io::ErrorKind::InvalidData.into());
+            }
+            let code = self.times.code(*secs);
+            write!(out, "            {code}: ")?;
+            write_vectors(out, &frame.positions)?;
+            writeln!(out, ",")?;
+            write!(of_normals, "            {code}: ")?;
+            write_vectors(&mut of_normals, &frame.normals)?;
+            writeln!(of_normals, ",")?;
+            let corner = |start: Vec3, pick: fn(Vec3, Vec3) -> Vec3| frame.positions.iter().copied().fold(start, pick);
+            extents.push([corner(Vec3::INFINITY, Vec3::min), corner(Vec3::NEG_INFINITY, Vec3::max)]);
+        }
+        of_normals.flush()?;
+        writeln!(out, "        }}")?;
+        Ok(extents)
     }
-    writeln!(out, "}}")
 }
 
-/// Writes the values of an attribute at the times of frames.
-fn write_samples<'a>(
-    out: &mut impl Write,
-    attribute: &str,
-    frames: &[MeshFrame<'a>],
-    times: &Times,
-    values: fn(&MeshFrame<'a>) -> &'a [Vec3],
-) -> io::Result<()> {
-    write!(out, "\n        {attribute}.timeSamples = {{\n")?;
-    for frame in frames {
-        write!(out, "            {}: ", times.code(frame.secs))?;
-        write_vectors(out, values(frame))?;
-        writeln!(out, ",")?;
+/// Returns what is wrong with a frame.
+fn problem(frame: &MeshFrame, secs: f64, vertices: usize) -> Option<String> {
+    let (positions, normals) = (frame.positions.len(), frame.normals.len());
+    if (positions, normals) != (vertices, vertices) {
+        return Some(format!("the frame at {secs} s has {positions} positions and {normals} normals of {vertices}"));
     }
-    writeln!(out, "        }}")
+    let vertex = frame.positions.iter().zip(&frame.normals).position(|(p, n)| !p.is_finite() || !n.is_finite())?;
+    Some(format!("vertex {vertex} of the frame at {secs} s is not a finite number"))
 }
