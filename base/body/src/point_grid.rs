@@ -84,19 +84,23 @@ impl PointGrid {
 
     /// Calls `visit(index, squared distance)` for each point within `radius`, in a fixed order.
     pub fn within(&self, centre: Vec3, radius: f32, mut visit: impl FnMut(usize, f32)) {
-        let low = self.cell_of(centre - radius);
-        let high = self.cell_of(centre + radius);
+        self.near_box(centre - radius, centre + radius, |index, point| {
+            let squared = point.distance_squared(centre);
+            if squared <= radius * radius {
+                visit(index, squared);
+            }
+        });
+    }
+
+    /// Calls `visit(index, position)` for each point of a box and for some beside it, in a fixed order.
+    pub fn near_box(&self, low: Vec3, high: Vec3, mut visit: impl FnMut(usize, Vec3)) {
+        let (low, high) = (self.cell_of(low), self.cell_of(high));
         for z in low.z..=high.z {
             for y in low.y..=high.y {
                 // Blocks of a row lie side by side.
                 let first = self.starts[self.block(IVec3::new(low.x, y, z))] as usize;
                 let last = self.starts[self.block(IVec3::new(high.x, y, z)) + 1] as usize;
-                for &(i, point) in &self.sorted[first..last] {
-                    let squared = point.distance_squared(centre);
-                    if squared <= radius * radius {
-                        visit(i as usize, squared);
-                    }
-                }
+                self.sorted[first..last].iter().for_each(|(index, point)| visit(*index as usize, *point));
             }
         }
     }
@@ -122,6 +126,29 @@ mod tests {
             }
         }
         PointGrid::new(&[], 1.0).within(Vec3::ZERO, 1.0, |_, _| panic!("no points"));
+    }
+
+    #[test]
+    fn the_grid_finds_all_points_of_a_box() {
+        let mut rng = rand::rngs::StdRng::seed_from_u64(5);
+        let mut points: Vec<Vec3> = (0..500).map(|_| Vec3::from_array(rng.random::<[f32; 3]>()) - 0.5).collect();
+        let (low, high) = (Vec3::new(-0.2, -0.3, 0.0), Vec3::new(0.1, 0.3, 0.2));
+        for (stray, cell) in [(false, 0.05), (false, 0.3), (true, 0.1)] {
+            if stray {
+                points.extend([Vec3::splat(1e30), Vec3::splat(-1e30), Vec3::splat(f32::MAX)]);
+            }
+            let grid = PointGrid::new(&points, cell);
+            let inside = |index: &usize| points[*index].cmpge(low).all() && points[*index].cmple(high).all();
+            let mut found = Vec::new();
+            grid.near_box(low, high, |index, position| {
+                assert_eq!(position, points[index]);
+                found.push(index);
+            });
+            found.retain(inside);
+            found.sort_unstable();
+            assert_eq!(found, (0..points.len()).filter(inside).collect::<Vec<_>>());
+        }
+        PointGrid::new(&[], 0.1).near_box(Vec3::ZERO, Vec3::ONE, |_, _| panic!("no points"));
     }
 
     #[test]

@@ -61,7 +61,7 @@ impl Connectivity {
         [self.open_edges, self.crowded_edges, self.twisted_edges, self.pinched_vertices, self.degenerate_triangles]
     }
 
-    /// Measures the topology and returns the vertices at its defects, ascending.
+    /// Measures the topology and returns the vertices at its defects other than open edges, ascending.
     pub(crate) fn with_faults(triangles: &[[u32; 3]]) -> (Self, Vec<u32>) {
         let mut found = Self::default();
         let mut faults = HashSet::new();
@@ -81,7 +81,10 @@ impl Connectivity {
         }
         for (edge, [up, down]) in &edges {
             match (up + down, up.abs_diff(*down)) {
-                (1, _) => found.open_edges += 1,
+                (1, _) => {
+                    found.open_edges += 1;
+                    continue;
+                }
                 (2, 0) => continue,
                 (2, _) => found.twisted_edges += 1,
                 _ => found.crowded_edges += 1,

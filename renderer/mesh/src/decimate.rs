@@ -1,26 +1,13 @@
 //! Simplification of a mesh to a number of triangles.
-//!
-//! Quadric edge collapse (Garland and Heckbert 1997) as implemented by meshoptimizer, which keeps a subset of the vertices
-//! where they are. It does not test the link condition of a collapse, so thin parts fold into flaps, which are removed, or
-//! pinch. The result is therefore checked; vertices around defects are locked and the simplification repeated, with a milder
-//! target when that does not help.
-
-use std::collections::HashMap;
 
 use glam::Vec3;
-use meshopt::{DecodePosition, SimplifyOptions, simplify_with_locks_decoder};
 use rayon::prelude::*;
 
+use crate::collapse::collapse;
 use crate::nearest::Surface;
-use crate::{Connectivity, MeshFault, TriMesh};
+use crate::{MeshFault, TriMesh};
 
-/// Even triangles: without, a bumpy sphere of 20,000 triangles falls into 114 charts of its texture instead of 15. The mean
-/// distance is the same there, and about a third larger at 4,000 triangles.
-const OPTIONS: SimplifyOptions = SimplifyOptions::RegularizeLight;
-/// Simplifications with more locks each, and bisections of the target after them.
-const LOCKINGS: usize = 12;
-const BISECTIONS: usize = 5;
-/// Vertices that the simplifier can address.
+/// Vertices that the simplification can address.
 const MAX_VERTICES: usize = 1 << 28;
 
 /// Reason why a mesh cannot be simplified.
@@ -37,7 +24,8 @@ pub enum DecimateError {
 /// Simplified mesh and its distance from the original.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Decimated {
-    /// Simplified mesh; it has more triangles than the target where the topology requires them.
+    /// Simplified mesh; it has more triangles than the target where the topology requires them. Its vertices are some of the
+    /// original ones.
     pub mesh: TriMesh,
     /// Index of the original vertex of each vertex.
     pub source: Vec<u32>,
@@ -45,8 +33,6 @@ pub struct Decimated {
     pub max_distance_m: f32,
     /// Mean distance of original vertices from the new surface, metres.
     pub mean_distance_m: f32,
-    /// Number of simplifications that were tried.
-    pub attempts: usize,
 }
 
 /// Simplifies a mesh to about `target` triangles without making its topology worse: closed manifold meshes stay closed,
@@ -60,7 +46,8 @@ pub fn decimate(mesh: &TriMesh, target: usize) -> Result<Decimated, DecimateErro
     if mesh.positions.len() >= MAX_VERTICES {
         return Err(DecimateError::TooLarge(mesh.positions.len()));
     }
-    let (triangles, attempts) = simplify(mesh, target);
+    let is_small = mesh.triangles.len() <= target;
+    let triangles = if is_small { mesh.triangles.clone() } else { collapse(&mesh.positions, &mesh.triangles, target) };
     let mut index = vec![u32::MAX; mesh.positions.len()];
     triangles.as_flattened().iter().for_each(|i| index[*i as usize] = 0);
     let source: Vec<u32> = (0u32..).zip(&index).filter(|(_, used)| **used == 0).map(|(i, _)| i).collect();
@@ -72,91 +59,8 @@ pub fn decimate(mesh: &TriMesh, target: usize) -> Result<Decimated, DecimateErro
         triangles: triangles.iter().map(|t| t.map(|i| index[i as usize])).collect(),
         from_hole: source.iter().filter_map(|i| mesh.from_hole.get(*i as usize).copied()).collect(),
     };
-    let (max_distance_m, mean_distance_m) = if attempts == 0 { (0.0, 0.0) } else { distances(mesh, &simple) };
-    Ok(Decimated { mesh: simple, source, max_distance_m, mean_distance_m, attempts })
-}
-
-/// Returns the triangles that remain, by original indices, and the number of attempts.
-fn simplify(mesh: &TriMesh, target: usize) -> (Vec<[u32; 3]>, usize) {
-    let all = mesh.triangles.len();
-    if all <= target {
-        return (mesh.triangles.clone(), 0);
-    }
-    let before = Connectivity::new(&mesh.triangles);
-    let points: Vec<Point> = mesh.positions.iter().copied().map(Point).collect();
-    let mut locks = vec![false; points.len()];
-    let mut attempts = 0;
-    for _ in 0..LOCKINGS {
-        let triangles = collapse(&mesh.triangles, &points, &locks, target);
-        let (after, faults) = Connectivity::with_faults(&triangles);
-        attempts += 1;
-        if after.is_no_worse_than(&before) {
-            return (triangles, attempts);
-        }
-        if !lock(&mut locks, &mesh.triangles, &faults) {
-            break;
-        }
-    }
-    let (mut low, mut high, mut best) = (target, all, mesh.triangles.clone());
-    for _ in 0..BISECTIONS {
-        let middle = low.midpoint(high);
-        let triangles = collapse(&mesh.triangles, &points, &locks, middle);
-        attempts += 1;
-        if Connectivity::new(&triangles).is_no_worse_than(&before) {
-            (high, best) = (middle, triangles);
-        } else {
-            low = middle;
-        }
-    }
-    (best, attempts)
-}
-
-/// Locks the vertices at `faults` and their neighbours in the original mesh. Returns whether any was unlocked before.
-fn lock(locks: &mut [bool], triangles: &[[u32; 3]], faults: &[u32]) -> bool {
-    let mut is_fault = vec![false; locks.len()];
-    faults.iter().for_each(|i| is_fault[*i as usize] = true);
-    let near = triangles.iter().filter(|t| t.iter().any(|i| is_fault[*i as usize]));
-    let mut is_new = false;
-    for i in near.flatten() {
-        is_new |= !std::mem::replace(&mut locks[*i as usize], true);
-    }
-    is_new
-}
-
-/// Position in the form that the simplifier reads.
-struct Point(Vec3);
-
-impl DecodePosition for Point {
-    fn decode_position(&self) -> [f32; 3] {
-        self.0.to_array()
-    }
-}
-
-fn collapse(triangles: &[[u32; 3]], points: &[Point], locks: &[bool], target: usize) -> Vec<[u32; 3]> {
-    let indices = triangles.as_flattened();
-    // The error limit is relative to the extents; the number of triangles alone ends the simplification.
-    let limit = 1.0;
-    let kept = simplify_with_locks_decoder(indices, points, locks, 3 * target, limit, OPTIONS, None);
-    without_flaps(kept.as_chunks().0)
-}
-
-/// Removes pairs of triangles that use the same vertices in opposite order: they enclose nothing and are left over from
-/// thin tips. Edges keep as many triangles in one direction as in the other.
-fn without_flaps(triangles: &[[u32; 3]]) -> Vec<[u32; 3]> {
-    let mut open: HashMap<([u32; 3], bool), Vec<usize>> = HashMap::new();
-    let mut is_kept = vec![true; triangles.len()];
-    for (i, triangle) in triangles.iter().enumerate() {
-        let [a, b, c] = *triangle;
-        let mut sorted = *triangle;
-        sorted.sort_unstable();
-        let is_ascending = [[a, b, c], [b, c, a], [c, a, b]].contains(&sorted);
-        if let Some(opposite) = open.get_mut(&(sorted, !is_ascending)).and_then(Vec::pop) {
-            (is_kept[opposite], is_kept[i]) = (false, false);
-        } else {
-            open.entry((sorted, is_ascending)).or_default().push(i);
-        }
-    }
-    triangles.iter().zip(is_kept).filter(|(_, kept)| *kept).map(|(t, _)| *t).collect()
+    let (max_distance_m, mean_distance_m) = if is_small { (0.0, 0.0) } else { distances(mesh, &simple) };
+    Ok(Decimated { mesh: simple, source, max_distance_m, mean_distance_m })
 }
 
 /// Returns the largest distance of both surfaces, and the mean one of original vertices in use, metres.
@@ -178,7 +82,7 @@ fn distances(mesh: &TriMesh, simple: &TriMesh) -> (f32, f32) {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::shapes;
+    use crate::{Connectivity, shapes};
 
     fn with_flags(mut mesh: TriMesh) -> TriMesh {
         mesh.from_hole = mesh.positions.iter().map(|p| p.x > 0.2).collect();
@@ -242,13 +146,6 @@ mod tests {
     }
 
     #[test]
-    fn flaps_cancel_and_doubled_triangles_stay() {
-        assert_eq!(without_flaps(&[[0, 1, 2], [3, 4, 5], [2, 1, 0]]), [[3, 4, 5]]);
-        assert_eq!(without_flaps(&[[0, 1, 2], [1, 2, 0]]).len(), 2);
-        assert_eq!(without_flaps(&[[0, 1, 2], [1, 2, 0], [1, 0, 2]]), [[0, 1, 2]]);
-    }
-
-    #[test]
     fn open_meshes_do_not_get_more_defects() {
         let mut mesh = shapes::bumpy_sphere(20);
         mesh.triangles.retain(|t| mesh.positions[t[0] as usize].y < 1.1);
@@ -262,7 +159,7 @@ mod tests {
     fn small_meshes_are_unchanged_and_faulty_ones_refused() {
         let mesh = shapes::bumpy_sphere(4);
         let same = decimate(&mesh, 320).unwrap();
-        assert_eq!((&same.mesh, same.attempts, same.max_distance_m.to_bits()), (&mesh, 0, 0));
+        assert_eq!((&same.mesh, same.max_distance_m.to_bits()), (&mesh, 0));
         assert!(decimate(&TriMesh::default(), 0).unwrap().mesh.triangles.is_empty());
         let count = mesh.positions.len();
         let message = |change: fn(&mut TriMesh)| {

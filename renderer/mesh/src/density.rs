@@ -2,11 +2,11 @@
 
 use std::f32::consts::PI;
 
+use flyrig_body::PointGrid;
 use glam::Vec3;
 use rayon::prelude::*;
 
 use crate::error::MeshError;
-use crate::point_grid::PointGrid;
 use crate::points::OrientedPoints;
 
 /// Points whose neighbours are searched among all others for a first estimate of the spacing.
@@ -80,7 +80,7 @@ fn area(points: &OrientedPoints, grid: &PointGrid, at: usize, first_radius: f32)
     let mut radius = first_radius;
     for round in 0..3 {
         let mut count = 0;
-        grid.in_box(own - radius, own + radius, |other, position| {
+        grid.near_box(own - radius, own + radius, |other, position| {
             let near = own.distance_squared(position) <= radius * radius;
             count += usize::from(near && normal.dot(points.normals()[other]) > SAME_PATCH);
         });

@@ -6,7 +6,7 @@ use crate::carve::{Empty, carve};
 use crate::components::{Removed, keep_largest};
 use crate::density::Density;
 use crate::error::MeshError;
-use crate::field::fuse;
+use crate::field::fuse_blocks;
 use crate::marching_cubes::marching_cubes;
 use crate::mesh::TriMesh;
 use crate::points::{Dropped, OrientedPoints};
@@ -31,6 +31,8 @@ pub struct MeshOptions<'a> {
     pub empty: Option<Empty<'a>>,
     /// Number of bodies to keep; 0 counts as 1.
     pub bodies: usize,
+    /// Stores all blocks of the bounding box, those without points too: the same mesh, later. Measures what skipping them saves.
+    pub dense: bool,
 }
 
 /// Seconds per stage of [`mesh_from_points`].
@@ -81,7 +83,7 @@ pub struct MeshReport {
     pub seconds: MeshSeconds,
 }
 
-/// Reconstructs a closed, 2-manifold mesh from oriented points in metres: fusion into signed distances ([`fuse`]), signs
+/// Reconstructs a closed, 2-manifold mesh from oriented points in metres: fusion into signed distances ([`fuse`](crate::fuse)), signs
 /// where evidence lacks ([`close`]), cut of empty space ([`carve`]), extraction ([`marching_cubes`]), removal of floaters
 /// ([`keep_largest`]). Points far from all others are dropped first. Equal input gives equal bytes for any number of threads,
 /// except for the seconds in the report.
@@ -102,7 +104,7 @@ pub fn mesh_from_points(mut points: OrientedPoints, options: &MeshOptions) -> Re
         options.voxel_m.map_or(settings, |voxel_m| settings.with_voxel(voxel_m))
     };
     let settings = options.settings.unwrap_or_else(derived);
-    let mut field = timed(&mut seconds.fuse, || fuse(&points, &settings, options.fusion))?;
+    let mut field = timed(&mut seconds.fuse, || fuse_blocks(&points, &settings, options.fusion, options.dense))?;
     let signed_voxels = timed(&mut seconds.signs, || close(&mut field, &Winding::new(&points, &density)))?;
     let emptied_voxels = timed(&mut seconds.carve, || options.empty.map_or(Ok(0), |empty| carve(&mut field, empty)))?;
     let mesh = timed(&mut seconds.surface, || marching_cubes(&field));

@@ -21,6 +21,11 @@ type Row = ([i64; 3], u32);
 /// coordinates that are not finite are ignored.
 #[must_use]
 pub fn self_intersections(mesh: &TriMesh) -> usize {
+    intersecting(mesh).len()
+}
+
+/// Returns the pairs that [`self_intersections`] counts, in an order that depends on the mesh alone.
+pub(crate) fn intersecting(mesh: &TriMesh) -> Vec<[u32; 2]> {
     let boxes: Vec<Option<(DVec3, DVec3)>> = (0..mesh.triangles.len())
         .map(|i| {
             let [a, b, c] = mesh.corners(i);
@@ -28,7 +33,7 @@ pub fn self_intersections(mesh: &TriMesh) -> usize {
             finite.then(|| (a.min(b).min(c), a.max(b).max(c)))
         })
         .collect();
-    let Some(grid) = Grid::new(&boxes) else { return 0 };
+    let Some(grid) = Grid::new(&boxes) else { return Vec::new() };
     let overlap = |i: usize, j: usize| {
         boxes[i].zip(boxes[j]).is_some_and(|((a, b), (c, d))| a.cmple(d).all() && c.cmple(b).all())
     };
@@ -54,14 +59,16 @@ pub fn self_intersections(mesh: &TriMesh) -> usize {
             let is_first = first.is_some_and(|first| [first.z, first.y, first.x] == *place);
             is_first && overlap(i, j) && intersect(mesh, i, j)
         };
-        pairs.filter(hit).count()
+        pairs.filter(hit).map(|((_, i), (_, j))| [*i, *j]).collect::<Vec<_>>()
     };
     let with_large = |i: &usize| {
         // A pair of large triangles counts for the first of them.
         let others = (0..boxes.len()).filter(|j| *j > *i || large.binary_search(j).is_err());
-        others.filter(|j| overlap(*i, *j) && intersect(mesh, *i, *j)).count()
+        let hits = others.filter(|j| overlap(*i, *j) && intersect(mesh, *i, *j));
+        hits.map(|j| [*i as u32, j as u32]).collect::<Vec<_>>()
     };
-    cells.par_iter().map(in_cell).sum::<usize>() + large.par_iter().map(with_large).sum::<usize>()
+    let small = cells.par_iter().flat_map_iter(in_cell);
+    small.chain(large.par_iter().flat_map_iter(with_large)).collect()
 }
 
 /// Cells that the boxes of triangles touch.

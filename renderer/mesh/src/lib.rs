@@ -33,6 +33,7 @@
 
 mod atlas;
 mod carve;
+mod collapse;
 mod components;
 mod connectivity;
 mod decimate;
@@ -48,16 +49,19 @@ mod mesh;
 mod nearest;
 mod normalization;
 mod person;
-mod point_grid;
 mod points;
+mod quadric;
+mod relax;
 mod settings;
 #[cfg(test)]
 mod shapes;
 mod signs;
 mod skin;
+mod smooth;
 mod topology;
 mod triangle;
 mod union_find;
+mod untangle;
 mod winding;
 
 pub use atlas::{AtlasError, AtlasSettings, MeshAtlas, mesh_atlas};

@@ -57,20 +57,33 @@ impl Surface {
 
     /// Returns the distance from a point to the nearest triangle, metres; infinity without triangles.
     pub(crate) fn distance_m(&self, point: Vec3) -> f32 {
+        self.search(point).0.sqrt()
+    }
+
+    /// Returns the place of the surface that is nearest to a point; the point without triangles.
+    pub(crate) fn nearest(&self, point: Vec3) -> Vec3 {
+        self.search(point).1
+    }
+
+    /// Returns the squared distance to the nearest place, and this place.
+    fn search(&self, point: Vec3) -> (f32, Vec3) {
         let to_box = |node: usize| {
             self.nodes.get(node).map_or(f32::INFINITY, |n| point.distance_squared(point.clamp(n.low, n.high)))
         };
-        let mut best = f32::INFINITY;
+        let mut best = (f32::INFINITY, point);
         let mut open = vec![(to_box(0), 0)];
         while let Some((squared, i)) = open.pop() {
-            if squared >= best {
+            if squared >= best.0 {
                 continue;
             }
             let node = &self.nodes[i];
             for triangle in &self.triangles[node.range.clone()] {
                 let weights = closest_on_triangle(point, *triangle);
                 let nearest: Vec3 = triangle.iter().zip(weights).map(|(corner, weight)| *corner * weight).sum();
-                best = best.min(point.distance_squared(nearest));
+                let squared = point.distance_squared(nearest);
+                if squared < best.0 {
+                    best = (squared, nearest);
+                }
             }
             if node.range.is_empty() {
                 let mut children = [i + 1, node.second].map(|child| (to_box(child), child));
@@ -80,7 +93,7 @@ impl Surface {
                 open.extend(children);
             }
         }
-        best.sqrt()
+        best
     }
 }
 
@@ -106,8 +119,12 @@ mod tests {
             }
             let found = surface.distance_m(point);
             assert!(found <= expected + 1e-6 && found > expected - 0.006, "{found} {expected}");
+            let nearest = surface.nearest(point);
+            assert!((nearest.distance(point) - found).abs() < 1e-6 && surface.distance_m(nearest) < 1e-6);
         }
         assert!(surface.distance_m(mesh.positions[5]) < 1e-6);
-        assert!(Surface::new(&TriMesh::default()).distance_m(Vec3::ZERO).is_infinite());
+        let nothing = Surface::new(&TriMesh::default());
+        assert!(nothing.distance_m(Vec3::ZERO).is_infinite());
+        assert_eq!(nothing.nearest(Vec3::ONE), Vec3::ONE);
     }
 }

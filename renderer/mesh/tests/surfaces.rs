@@ -164,6 +164,22 @@ fn thin_shells_of_points_are_filled() {
     assert!(report.skipped_blocks > 10 && report.signed_voxels > 0);
 }
 
+/// Blocks without points are skipped; the mesh is that of a field with all of them, byte by byte.
+#[test]
+fn skipped_blocks_change_nothing() {
+    let rows = [sphere(20_000, Vec3::ZERO, 0.2), torus(20_000, 0.3, 0.05)].concat();
+    for voxel_m in [0.006, 0.012] {
+        let run = |dense| {
+            let points = OrientedPoints::from_rows(rows.clone());
+            mesh_from_points(points, &MeshOptions { dense, bodies: 2, ..voxel(voxel_m) }).unwrap()
+        };
+        let ((sparse, skipping), (all, report)) = (run(false), run(true));
+        assert_eq!(sparse, all);
+        assert!(skipping.skipped_blocks > report.blocks / 3, "{skipping:?}");
+        assert_eq!((report.skipped_blocks, report.blocks), (0, skipping.blocks + skipping.skipped_blocks));
+    }
+}
+
 #[test]
 fn floaters_and_distant_points_are_removed() {
     let mut rows = sphere(50_000, Vec3::ZERO, 0.3);

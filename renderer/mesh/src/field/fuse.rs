@@ -1,9 +1,9 @@
 //! Fusion of points into the field, in parallel by block.
 
+use flyrig_body::PointGrid;
 use glam::{IVec3, Vec3};
 
 use crate::error::MeshError;
-use crate::point_grid::PointGrid;
 use crate::points::OrientedPoints;
 use crate::settings::{Fusion, FusionSettings};
 
@@ -27,6 +27,16 @@ const BRICK: i32 = 2;
 /// [`MeshError::Setting`] for settings outside their ranges, [`MeshError::TooFewPoints`] for no points, and
 /// [`MeshError::Extent`] if the grid would need more blocks than fit into memory.
 pub fn fuse(points: &OrientedPoints, settings: &FusionSettings, fusion: Fusion) -> Result<Field, MeshError> {
+    fuse_blocks(points, settings, fusion, false)
+}
+
+/// Fuses points as [`fuse`] does; `dense` stores the blocks without points too.
+pub(crate) fn fuse_blocks(
+    points: &OrientedPoints,
+    settings: &FusionSettings,
+    fusion: Fusion,
+    dense: bool,
+) -> Result<Field, MeshError> {
     settings.check()?;
     let positions = points.positions();
     let (Some(low), Some(high)) =
@@ -37,7 +47,7 @@ pub fn fuse(points: &OrientedPoints, settings: &FusionSettings, fusion: Fusion) 
     let radius = settings.truncation_m;
     let mut field = Field::around(low, high, settings.voxel_m, radius)?;
     let grid = PointGrid::new(positions, radius);
-    let blocks = field.blocks_touched(positions, radius);
+    let blocks = if dense { field.skipped_blocks() } else { field.blocks_touched(positions, radius) };
     let lattice = field.clone();
     field.store(&blocks, &|block, distances, evidence| {
         fill(&lattice, points, &grid, (settings, fusion), block, distances, evidence);
@@ -58,7 +68,7 @@ fn fill(
     let corner = |lattice: IVec3| field.position(lattice);
     let (low, high) = (corner(block * SIDE), corner(block * SIDE + (SIDE - 1)));
     let (mut around, mut nearby) = (Nearby::default(), Nearby::default());
-    grid.in_box(low - radius, high + radius, |index, position| {
+    grid.near_box(low - radius, high + radius, |index, position| {
         if position.distance_squared(position.clamp(low, high)) <= radius * radius {
             around.push(points, index);
         }

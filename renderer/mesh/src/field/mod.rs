@@ -7,4 +7,5 @@ mod lattice;
 
 pub use blocks::{Evidence, Field, Voxel};
 pub use fuse::fuse;
+pub(crate) use fuse::fuse_blocks;
 pub(crate) use lattice::{SIDE, VOXELS, local_of, voxel_of};

@@ -40,14 +40,17 @@ fn wide_of(local: IVec3) -> usize {
 /// its blocks end.
 #[must_use]
 pub fn marching_cubes(field: &Field) -> TriMesh {
-    let slots = 0..field.stored_blocks();
-    let vertices: Vec<BlockVertices> = slots.clone().into_par_iter().map(|slot| block_vertices(field, slot)).collect();
-    let mut starts = Vec::with_capacity(vertices.len());
+    // In the order of space: blocks without a surface that are stored all the same change nothing.
+    let mut slots: Vec<usize> = (0..field.stored_blocks()).collect();
+    slots.sort_unstable_by_key(|slot| (field.blocks()[*slot].z, field.blocks()[*slot].y, field.blocks()[*slot].x));
+    let vertices: Vec<BlockVertices> =
+        (0..slots.len()).into_par_iter().map(|slot| block_vertices(field, slot)).collect();
+    let mut starts = vec![0; vertices.len()];
     let mut mesh = TriMesh::default();
-    for block in &vertices {
-        starts.push(mesh.positions.len() as u32);
-        mesh.positions.extend(&block.positions);
-        mesh.from_hole.extend(&block.from_hole);
+    for slot in &slots {
+        starts[*slot] = mesh.positions.len() as u32;
+        mesh.positions.extend(&vertices[*slot].positions);
+        mesh.from_hole.extend(&vertices[*slot].from_hole);
     }
     let vertex = |lattice: IVec3, axis: u8| -> Option<u32> {
         let block = lattice.div_euclid(IVec3::splat(SIDE));

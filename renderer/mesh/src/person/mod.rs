@@ -12,7 +12,7 @@ use glam::{DVec3, Vec2, Vec3, Vec4};
 use crate::{
     AtlasError, AtlasSettings, DecimateError, MeshAtlas, MeshError, MeshOptions, MeshReport, OrientedPoint,
     OrientedPoints, SkinReport, SkinSettings, Topology, TriMesh, decimate, mesh_atlas, mesh_from_points,
-    person::hang::hang, skin_weights,
+    person::hang::hang, relax::relax, skin_weights, smooth::smooth, untangle::untangle,
 };
 
 /// Mesh of a person that poses and a deformation graph move.
@@ -64,7 +64,7 @@ impl Default for PersonOptions<'_> {
 /// Counts of [`MeshedPerson::of_avatar`].
 #[derive(Debug, Clone)]
 pub struct PersonReport {
-    /// Topology of the simplified mesh.
+    /// Topology of the simplified and smoothed mesh.
     pub topology: Topology,
     /// Mean distance of the simplified mesh from the fused one, metres.
     pub simplified_by_m: f32,
@@ -72,7 +72,7 @@ pub struct PersonReport {
     pub charts: u32,
     /// Share of its texels that they cover, 0..=1.
     pub coverage: f32,
-    /// Seconds of simplification, of skin and graph, and of the texture.
+    /// Seconds of simplification and smoothing, of skin and graph, and of the texture.
     pub seconds: [f64; 3],
     /// Fusion and surface.
     pub mesh: MeshReport,
@@ -81,8 +81,8 @@ pub struct PersonReport {
 }
 
 impl MeshedPerson {
-    /// Meshes the surface that an avatar's Gaussians draw in the rest pose, where a hand cannot grow onto a hip, simplifies it, and gives it
-    /// skin, nodes and a texture.
+    /// Meshes the surface that an avatar's Gaussians draw in the rest pose, where a hand cannot grow onto a hip, simplifies and
+    /// smooths it, and gives it skin, nodes and a texture.
     ///
     /// # Errors
     /// As [`mesh_from_points`], and [`PersonError`] where the mesh cannot be simplified or textured.
@@ -91,7 +91,11 @@ impl MeshedPerson {
         avatar.pose(&Bones::at_rest(&avatar.template.skeleton), None, &mut posed);
         let (fused, mesh) = mesh_from_points(drawn_points(&posed), &options.mesh)?;
         let started = Instant::now();
-        let simple = decimate(&fused, options.triangles)?;
+        let mut simple = decimate(&fused, options.triangles)?;
+        let corners = simple.mesh.positions.clone();
+        relax(&mut simple.mesh, &fused);
+        smooth(&mut simple.mesh, mesh.settings.spacing_m);
+        untangle(&mut simple.mesh, &corners);
         let simplified_s = started.elapsed().as_secs_f64();
         let started = Instant::now();
         let (tied, skin) = Self::tie(&simple.mesh, avatar, &posed);
