@@ -8,7 +8,7 @@ use crate::density::median;
 use crate::mesh::area_vector;
 
 /// Distance over which normals are averaged, in spacings of the points that the surface was fused from.
-const SPACINGS: f64 = 3.0;
+const SPACINGS: f64 = 2.0;
 /// Variance along the surface of one round of averages over adjacent triangles, in squared lengths of an edge.
 const ROUND: f64 = 0.3;
 /// Largest number of rounds.
@@ -133,7 +133,7 @@ mod tests {
         for truth in [shapes::bumpy_sphere(40), shapes::two_tori(200, 40)] {
             let mut mesh = rough(&truth, 0.006);
             let before = angle_errors(&mesh, &truth);
-            smooth(&mut mesh, 0.012);
+            smooth(&mut mesh, 0.018);
             let after = angle_errors(&mesh, &truth);
             assert!(after < 0.4 * before, "{before} {after}");
             let ratio = shapes::volume(&mesh) / shapes::volume(&truth);
@@ -168,7 +168,7 @@ mod tests {
             *p = d / d.abs().max_element() * 0.3;
         }
         let mut mesh = rough(&truth, 0.001);
-        smooth(&mut mesh, 0.012);
+        smooth(&mut mesh, 0.018);
         let at_edge = |p: &Vec3| p.to_array().iter().filter(|x| x.abs() > 0.285).count() >= 2;
         let edge = truth.positions.iter().enumerate().filter(|(_, p)| at_edge(p));
         let (mut count, mut sum) = (0, 0.0);
