@@ -58,6 +58,7 @@ mod shapes;
 mod signs;
 mod skin;
 mod smooth;
+mod texture;
 mod topology;
 mod triangle;
 mod union_find;
@@ -87,5 +88,9 @@ pub use points::{Dropped, OrientedPoint, OrientedPoints};
 pub use settings::{Fusion, FusionSettings};
 pub use signs::close;
 pub use skin::{SkinReport, SkinSettings, skin_weights};
+pub use texture::{
+    DrawnMesh, Photo, PhotoError, PhotoInputs, PhotoSettings, PhotoTexture, Poser, TexturedMesh, draw_textured,
+    photograph_texture,
+};
 pub use topology::Topology;
 pub use winding::Winding;

@@ -195,8 +195,8 @@ fn composite(mut near: Vec<(f32, usize, f32)>, shown: &Shown, colors: &[Vec3]) -
     near.into_iter().min_by(|a, b| a.2.total_cmp(&b.2)).map(|(_, i, _)| colors[i])
 }
 
-/// Calls `visit(index, barycentric)` for the texels whose centres lie in a triangle.
-pub(crate) fn each_texel([a, b, c]: [Vec2; 3], side: u32, mut visit: impl FnMut(usize, [f32; 3])) {
+/// Calls `visit(index, barycentric)` for the texels whose centres lie in a triangle, given in texels. Triangles without area are ignored.
+pub fn each_texel([a, b, c]: [Vec2; 3], side: u32, mut visit: impl FnMut(usize, [f32; 3])) {
     let area = (b - a).perp_dot(c - a);
     if area.abs() < 1e-12 || !area.is_finite() {
         return;
@@ -216,8 +216,8 @@ pub(crate) fn each_texel([a, b, c]: [Vec2; 3], side: u32, mut visit: impl FnMut(
     }
 }
 
-/// Extends colours outwards, ring by ring.
-pub(crate) fn grow(image: &mut [Option<[u8; 3]>], side: usize) {
+/// Extends the colours of a texture of `side` texels a side outwards, ring by ring, so that downsampled textures have no dark seams.
+pub fn grow(image: &mut [Option<[u8; 3]>], side: usize) {
     for _ in 0..GUTTER {
         let before = image.to_vec();
         for (i, color) in image.iter_mut().enumerate().filter(|(_, color)| color.is_none()) {

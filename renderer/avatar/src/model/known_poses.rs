@@ -23,6 +23,12 @@ impl KnownPoses {
         Self(poses.iter().step_by(step).map(rounded).collect())
     }
 
+    /// Returns the local rotations of the joints, one list per frame.
+    #[must_use]
+    pub fn rotations(&self) -> &[Vec<DQuat>] {
+        &self.0
+    }
+
     /// Returns the share of the Gaussians in a pose unlike those of the take: the joints that move them, and with a
     /// third of the weight their parents, differ by more than 30 degrees (root mean square) from every frame. 0 where
     /// no pose is known.

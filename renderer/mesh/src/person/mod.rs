@@ -1,6 +1,7 @@
 //! Closed, textured mesh of a person: the surface that an avatar's Gaussians draw, tied to its skeleton and deformation graph.
 
 mod hang;
+mod photograph;
 
 use std::time::Instant;
 
