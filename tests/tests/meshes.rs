@@ -26,12 +26,18 @@ fn a_take_becomes_a_closed_mesh_that_moves_as_the_person_does() {
             [&take, "--inputs", "00,02,04", "--frames", "0..4", "--gaussians", "4000", "--steps", "5", "--out", out];
         mesh(&[&args[..], &GIVEN, more].concat())
     };
-    let made = of_take("m", &["--sequence"]);
+    let made = of_take("m", &["--sequence", "--holdout", "01,03"]);
     assert_eq!(made.code, Some(0), "{made:?}");
     let at = |name: &str| folder.path().join("m").join(name);
     let metrics: serde_json::Value = serde_json::from_slice(&fs::read(at("metrics.json")).unwrap()).unwrap();
     assert_eq!((&metrics["closed_manifold"], &metrics["components"]), (&true.into(), &1.into()), "{metrics}");
     assert!(number(&metrics, "triangles") <= 4000.0 && number(&metrics, "volume_m3") > 0.03, "{metrics}");
+    // Photographs make most of the texture, and the textured mesh looks like the person from cameras that were left out.
+    let seen = number(&metrics, "texture_from_photographs");
+    assert!((0.3..1.0).contains(&seen), "{seen}");
+    let held_out = |what: &str| number(&metrics["held_out"][what], "psnr_db");
+    let (mesh_db, gaussians_db) = (held_out("mesh"), held_out("gaussians"));
+    assert!(mesh_db > 15.0 && mesh_db > gaussians_db - 2.0, "{mesh_db} {gaussians_db}");
 
     // Skin and motion bring the mesh to where its surface was written.
     let human = load_gltf(&at("mesh.glb")).unwrap();
@@ -49,10 +55,14 @@ fn a_take_becomes_a_closed_mesh_that_moves_as_the_person_does() {
     for name in ["mesh.obj", "mesh.mtl", "mesh.png", "mesh.usdz", "mesh.3mf", "sequence.usda"] {
         assert!(fs::metadata(at(name)).unwrap().len() > 60, "{name}");
     }
-    // The same take gives the same mesh.
+    // The same take gives the same mesh, with or without cameras to compare with.
     assert_eq!(of_take("again", &[]).code, Some(0));
     let bytes = |folder: &Path| fs::read(folder.join("mesh.glb")).unwrap();
     assert!(bytes(&folder.path().join("m")) == bytes(&folder.path().join("again")), "reruns differ");
+    // Light in the texture changes its colours alone.
+    assert_eq!(of_take("lit", &["--light", "baked"]).code, Some(0));
+    let file = |out: &str, name: &str| fs::read(folder.path().join(out).join(name)).unwrap();
+    assert!(file("lit", "mesh.png") != file("m", "mesh.png") && file("lit", "mesh.3mf") == file("m", "mesh.3mf"));
 
     // From an avatar, in the rest pose and without a motion.
     let build = ["avatar", "build", &take, "--inputs", "00,02,04", "--frames", "0..4", "--gaussians", "4000"];
@@ -61,6 +71,8 @@ fn a_take_becomes_a_closed_mesh_that_moves_as_the_person_does() {
     let from_avatar = mesh(&["a.flyavatar", "--out", "avatar"]);
     assert_eq!(from_avatar.code, Some(0), "{from_avatar:?}");
     assert!(load_gltf(&folder.path().join("avatar/mesh.glb")).unwrap().track.is_none());
+    assert_eq!(mesh(&["a.flyavatar", "--out", "avatar-lit", "--light", "baked"]).code, Some(0));
+    assert!(file("avatar-lit", "mesh.png") != file("avatar", "mesh.png"));
 
     let refused = |args: &[&str], text: &str| {
         let before = fs::read_dir(folder.path()).unwrap().count();
@@ -72,6 +84,8 @@ fn a_take_becomes_a_closed_mesh_that_moves_as_the_person_does() {
     refused(&["a.flyavatar", "--out", "m"], "m exists already");
     refused(&["a.flyavatar", "--out", "none/m"], "the folder none does not exist");
     refused(&["a.flyavatar", "--out", "x", "--inputs", "00"], "is an avatar and not a take");
+    refused(&["a.flyavatar", "--out", "x", "--holdout", "01"], "leave out --inputs, --holdout");
+    refused(&[&take, "--out", "x", "--inputs", "00,02", "--holdout", "02"], "both an input and held out");
     refused(&["a.flyavatar", "--out", "."], "names no folder");
     fs::create_dir(folder.path().join("x.partial")).unwrap();
     fs::write(folder.path().join("x.partial/mine"), b"kept").unwrap();

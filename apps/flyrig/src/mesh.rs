@@ -1,6 +1,7 @@
 //! `flyrig mesh`: the person of a take, or an avatar, as a closed mesh with bones.
 
 mod arguments;
+mod photos;
 mod source;
 mod write;
 
@@ -29,10 +30,22 @@ pub fn mesh(args: &MeshArgs, gpu: &dyn Fn() -> Result<GpuContext>) -> Result<()>
         ..MeshOptions::default()
     };
     let options = PersonOptions { mesh, triangles: args.triangles as usize, texture_side: args.texture };
-    let (person, report) = MeshedPerson::of_avatar(&source.avatar, &options)
+    let (mut person, report) = MeshedPerson::of_avatar(&source.avatar, &options)
         .with_context(|| format!("no mesh of {}", args.take.dataset.display()))?;
+    let photos = photos::texture(&mut person, &source, args.light)?;
     let seconds = started.elapsed().as_secs_f64();
-    MeshFolder { out: &args.out, source: &source, person: &person, report: &report, seconds, args }.write()
+    let held_out = photos::compare(&person, &source, args.light, gpu)?;
+    MeshFolder {
+        out: &args.out,
+        source: &source,
+        person: &person,
+        report: &report,
+        photos: &photos,
+        held_out,
+        seconds,
+        args,
+    }
+    .write()
 }
 
 /// Checks before any work that the folder can be written: it is new or empty, and its parent takes folders.

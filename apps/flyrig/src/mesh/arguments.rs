@@ -43,9 +43,25 @@ pub struct MeshArgs {
     /// Texels along a side of the texture.
     #[arg(long, default_value_t = 2048, value_parser = clap::value_parser!(u32).range(64..=4096))]
     pub texture: u32,
+    /// Light in the texture; the texture of an avatar's file comes from its Gaussians in both cases.
+    #[arg(long, value_enum, default_value = "removed")]
+    pub light: LightKind,
+    /// Cameras of a take, comma separated, which are left out of everything and then compared with the textured mesh and with the
+    /// Gaussians at every tenth frame.
+    #[arg(long, value_delimiter = ',')]
+    pub holdout: Vec<String>,
     /// Write the surface of every frame of a take, in place of every tenth, and of all frames as one USD file.
     #[arg(long)]
     pub sequence: bool,
+}
+
+/// Light in a texture.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, ValueEnum)]
+pub enum LightKind {
+    /// Divided by the light of the take, as programs light the mesh again.
+    Removed,
+    /// As the person looked in the mean of the take.
+    Baked,
 }
 
 /// Fusion of oriented points.

@@ -13,7 +13,7 @@ use flyrig_takes::AvatarTake;
 use flyrig_types::PoseTrack;
 use glam::{DQuat, DVec3};
 
-use super::arguments::MeshArgs;
+use super::{arguments::MeshArgs, photos::Photos};
 use crate::avatar::{DrivenMotion, load, open_replay};
 
 /// Avatar, and the frames of its take.
@@ -29,6 +29,8 @@ pub(super) struct Source {
     pub motion: Option<PoseTrack>,
     /// Upward direction of the take's or the motion's world.
     pub up: DVec3,
+    /// Photographs of the take; none for an avatar from a file.
+    pub photos: Photos,
     /// Seconds of tracking and of the fit.
     pub tracked_s: f64,
     pub fitted_s: f64,
@@ -41,10 +43,11 @@ impl Source {
         if path.extension().is_some_and(|extension| extension == "flyavatar" || extension == "person") {
             ensure!(
                 args.take.inputs.is_empty()
+                    && args.holdout.is_empty()
                     && args.take.range.frames.is_none()
                     && args.frame.is_none()
                     && !args.sequence,
-                "{} is an avatar and not a take: leave out --inputs, --frames, --frame and --sequence",
+                "{} is an avatar and not a take: leave out --inputs, --holdout, --frames, --frame and --sequence",
                 path.display()
             );
             let avatar = load(path)?;
@@ -57,6 +60,7 @@ impl Source {
                 numbers: Vec::new(),
                 fps: 30.0,
                 up: DVec3::Z,
+                photos: Photos::default(),
                 tracked_s: 0.0,
                 fitted_s: 0.0,
             });
@@ -81,7 +85,7 @@ impl Source {
 
     fn track(args: &MeshArgs, gpu: &GpuContext) -> Result<Self> {
         let started = Instant::now();
-        let mut take_args = args.take.resolve("mesh", &[], gpu)?;
+        let mut take_args = args.take.resolve("mesh", &args.holdout, gpu)?;
         if let Some(frame) = args.frame {
             // What comes after it changes nothing.
             let range = take_args.range.frames.clone().unwrap_or(0..u64::MAX);
@@ -89,13 +93,15 @@ impl Source {
             take_args.range.frames = Some(range.start..frame + 1);
         }
         let body = BodySettings { gaussians: args.gaussians as usize, ..BodySettings::default() };
-        let mut replay = open_replay(&take_args, &[], (&body, None), gpu)?;
-        let take = AvatarTake::track(&mut replay, &body, HarmonicOrder::Zero, |_, _| Ok(()))
+        let mut replay = open_replay(&take_args, &args.holdout, (&body, None), gpu)?;
+        let mut photos = Photos::default();
+        let take = AvatarTake::track(&mut replay, &body, HarmonicOrder::Zero, |replay, set| photos.hold(replay, set))
             .with_context(|| format!("no mesh of {}", take_args.dataset.display()))?;
         let take = match args.frame {
             Some(frame) => take.only(frame)?,
             None => take,
         };
+        photos.views.clone_from(&take.views);
         let AvatarTake { frames, views, avatar, numbers, .. } = take;
         let tracked_s = started.elapsed().as_secs_f64();
         println!("tracked {} frames in {tracked_s:.0} s", frames.len());
@@ -118,7 +124,7 @@ impl Source {
             fit.into_model().into_avatar()
         };
         let fitted_s = started.elapsed().as_secs_f64();
-        Ok(Self { avatar, frames, motion: None, numbers, fps: take_args.rate.fps, up, tracked_s, fitted_s })
+        Ok(Self { avatar, frames, motion: None, numbers, fps: take_args.rate.fps, up, photos, tracked_s, fitted_s })
     }
 }
 

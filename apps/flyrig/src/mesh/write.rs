@@ -13,7 +13,7 @@ use flyrig_types::PoseTrack;
 use glam::{DMat4, Quat, Vec3};
 use serde_json::json;
 
-use super::{arguments::MeshArgs, source::Source};
+use super::{arguments::MeshArgs, photos::PhotoReport, source::Source};
 
 /// Frames from one written surface to the next, as `flyrig eval` writes them.
 const SURFACE_EVERY: u64 = 10;
@@ -35,7 +35,10 @@ pub(super) struct MeshFolder<'a> {
     pub source: &'a Source,
     pub person: &'a MeshedPerson,
     pub report: &'a PersonReport,
-    /// Seconds of fusion, surface and skin.
+    pub photos: &'a PhotoReport,
+    /// Scores at held-out cameras.
+    pub held_out: Option<serde_json::Value>,
+    /// Seconds of fusion, surface, skin and texture.
     pub seconds: f64,
     pub args: &'a MeshArgs,
 }
@@ -178,6 +181,8 @@ impl MeshFolder<'_> {
             "simplified_by_mm": 1e3 * self.report.simplified_by_m,
             "charts": self.report.charts,
             "texture_coverage": self.report.coverage,
+            "texture_from_photographs": self.photos.seen,
+            "held_out": self.held_out,
             "hole_share": mesh.hole_share,
             "voxel_mm": 1e3 * mesh.settings.voxel_m,
             "truncation_mm": 1e3 * mesh.settings.truncation_m,
@@ -198,6 +203,7 @@ impl MeshFolder<'_> {
                 "simplification": simplified_s,
                 "skin": tied_s,
                 "texture": textured_s,
+                "photographs": self.photos.seconds,
                 "all_after_tracking_and_fit": self.seconds,
             },
         })
