@@ -1,8 +1,10 @@
+use flyrig_avatar::KnownPoses;
 use flyrig_body::{DEFAULT_SIGMA2_M2, ShapeParams, build_graph, default_template, sample_surface};
 use flyrig_renderer::HarmonicOrder;
 use glam::DQuat;
 
 use super::*;
+use crate::PhotoSettings;
 
 /// Avatar of the built-in body as a rig makes it, with clothes that stand off by `clothes_m` to the front.
 fn avatar(clothes_m: f64) -> Avatar {
@@ -92,4 +94,30 @@ fn poisoned_gaussians_are_left_out() {
     .unwrap_err()
     .to_string();
     assert!(error.contains("10") && error.contains("1000"), "{error}");
+}
+
+#[test]
+fn the_texture_takes_the_mean_light_of_known_poses() {
+    let mut avatar = avatar(0.0);
+    avatar.light.terms[2] = [0.5, 0.4, 0.3];
+    let options = PersonOptions { triangles: 30_000, texture_side: 256, ..PersonOptions::default() };
+    let (person, _) = MeshedPerson::of_avatar(&avatar, &options).unwrap();
+    assert!(person.mean_shades(&avatar).iter().all(|shade| shade.distance(Vec3::ONE) < 1e-6), "no known pose");
+    let mut lying = avatar.template.skeleton.rest_pose();
+    lying.joint_rotations[0] = DQuat::from_rotation_x(1.5) * lying.joint_rotations[0];
+    let poses = [avatar.template.skeleton.rest_pose(), lying];
+    avatar.known_poses = KnownPoses::new(&poses);
+    let shades = person.mean_shades(&avatar);
+    let normals = poses.each_ref().map(|pose| person.posed(pose, None).1);
+    for (i, shade) in shades.iter().enumerate().step_by(97) {
+        let of = |k: usize| normals.iter().map(|n| f64::from(avatar.light.shade(n[i])[k])).sum::<f64>() / 2.0;
+        let off = (0..3).map(|k| (f64::from(shade[k]) - of(k)).abs()).fold(0.0, f64::max);
+        assert!(off < 2e-3, "{i}: {shade}");
+    }
+    let lit = person.lit_texture(&shades).unwrap();
+    assert!(lit.rgb != person.texture.rgb && lit.covered == person.texture.covered);
+    assert!(person.lit_texture(&shades[1..]).is_err());
+    // Without photographs the texture stays as it is.
+    let kept = person.photographed(&avatar.light, (&[], &[]), None, &PhotoSettings::default()).unwrap();
+    assert!(kept.seen <= 0.0 && kept.atlas == person.texture);
 }
