@@ -74,12 +74,6 @@ impl TrainingView {
         Self { frame, ..self }
     }
 
-    /// Returns the frame that the image shows.
-    #[must_use]
-    pub fn frame(&self) -> usize {
-        self.frame
-    }
-
     /// Returns the camera of the crop.
     #[must_use]
     pub fn camera(&self) -> &Camera {

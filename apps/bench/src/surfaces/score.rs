@@ -10,7 +10,7 @@ use super::true_surface::TrueSurface;
 use crate::harness::surface::Points;
 
 /// Points spread over a surface that is scored.
-const POINTS: usize = 100_000;
+const POINTS: usize = 300_000;
 /// Points whose nearest neighbours are searched; a fifth of those that they are searched among.
 const EVERY: usize = 5;
 

@@ -10,7 +10,7 @@ use super::depth::DepthImage;
 use crate::harness::surface::Points;
 
 /// Points spread over a true surface.
-const POINTS: usize = 100_000;
+const POINTS: usize = 300_000;
 /// Points farther behind the nearest surface than this are hidden, metres.
 const HIDDEN_M: f64 = 0.005;
 

@@ -25,14 +25,11 @@ pub(super) struct Photos {
     pub views: Vec<TrainingView>,
     /// Images of the held-out cameras.
     held: Vec<HeldImage>,
-    /// Frames so far.
-    frames: usize,
 }
 
 /// Image of a held-out camera.
 #[derive(Debug)]
 struct HeldImage {
-    frame: usize,
     number: u64,
     camera: Camera,
     image: Image,
@@ -49,11 +46,11 @@ pub(super) struct PhotoReport {
 }
 
 impl Photos {
-    /// Keeps the images of the held-out cameras of a frame in which the person was found.
-    pub fn hold(&mut self, replay: &mut Replay, set: &FrameSet) -> Result<()> {
-        let (frame, number) = (self.frames, frame_number(set));
-        self.frames += 1;
-        if replay.holdout.is_empty() || !number.is_multiple_of(HELD_EVERY) {
+    /// Keeps the images of the held-out cameras of every tenth frame, or of `only` this one.
+    pub fn hold(&mut self, replay: &mut Replay, set: &FrameSet, only: Option<u64>) -> Result<()> {
+        let number = frame_number(set);
+        let is_held = only.map_or(number.is_multiple_of(HELD_EVERY), |only| only == number);
+        if replay.holdout.is_empty() || !is_held {
             return Ok(());
         }
         let truths = replay.truth.at(set.master_nanos)?;
@@ -61,7 +58,7 @@ impl Photos {
             let Some(truth) = truth else { continue };
             let (image, mask) = (&truth.image, truth.mask.clone());
             let image = Image::new(image.width(), image.height(), image.format(), image.bytes().to_vec())?;
-            self.held.push(HeldImage { frame, number, camera: camera.clone(), image, mask });
+            self.held.push(HeldImage { number, camera: camera.clone(), image, mask });
         }
         Ok(())
     }
@@ -106,9 +103,10 @@ pub(super) fn compare(
         return Ok(None);
     }
     let mut scene = DetailedScene::new(&gpu()?.fastest(), avatar.clone(), true)?;
-    for HeldImage { frame, number, camera, image, mask } in &source.photos.held {
+    for HeldImage { number, camera, image, mask } in &source.photos.held {
         ensure!(!stop::requested(), "stopped; nothing was written");
-        let Some(frame) = source.frames.get(*frame) else { continue };
+        let at = source.numbers.iter().position(|known| known == number);
+        let Some(frame) = at.and_then(|at| source.frames.get(at)) else { continue };
         let score = |sheet: &mut ScoreSheet, view: &RenderedView| -> Result<()> {
             sheet.extend(score_view(&camera.id, *number, view, image, mask.as_ref())?);
             Ok(())

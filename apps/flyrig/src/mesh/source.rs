@@ -95,8 +95,10 @@ impl Source {
         let body = BodySettings { gaussians: args.gaussians as usize, ..BodySettings::default() };
         let mut replay = open_replay(&take_args, &args.holdout, (&body, None), gpu)?;
         let mut photos = Photos::default();
-        let take = AvatarTake::track(&mut replay, &body, HarmonicOrder::Zero, |replay, set| photos.hold(replay, set))
-            .with_context(|| format!("no mesh of {}", take_args.dataset.display()))?;
+        let take = AvatarTake::track(&mut replay, &body, HarmonicOrder::Zero, |replay, set| {
+            photos.hold(replay, set, args.frame)
+        })
+        .with_context(|| format!("no mesh of {}", take_args.dataset.display()))?;
         let take = match args.frame {
             Some(frame) => take.only(frame)?,
             None => take,

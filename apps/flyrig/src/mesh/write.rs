@@ -13,7 +13,11 @@ use flyrig_types::PoseTrack;
 use glam::{DMat4, Quat, Vec3};
 use serde_json::json;
 
-use super::{arguments::MeshArgs, photos::PhotoReport, source::Source};
+use super::{
+    arguments::{LightKind, MeshArgs},
+    photos::PhotoReport,
+    source::Source,
+};
 
 /// Frames from one written surface to the next, as `flyrig eval` writes them.
 const SURFACE_EVERY: u64 = 10;
@@ -66,7 +70,11 @@ impl MeshFolder<'_> {
     fn write_to(&self, folder: &Path) -> Result<()> {
         let (track, template) = (self.track()?, &self.person.template);
         let texture = png::encode_rgb(&self.person.texture.rgb, self.person.texture.side, self.person.texture.side)?;
-        let contents = GlbContents { track: track.as_ref(), texture: Some(&texture), is_lit: true };
+        let contents = GlbContents {
+            track: track.as_ref(),
+            texture: Some(&texture),
+            is_lit: self.args.light == LightKind::Removed,
+        };
         write_glb(&folder.join("mesh.glb"), template, contents)?;
         let file = MeshFile {
             positions: &template.positions,
@@ -136,7 +144,8 @@ impl MeshFolder<'_> {
     /// Writes the surfaces of the frames: as PLY in the take's own axes, every tenth or, as a sequence, all, which become one USD stage
     /// with y up as well. Each frame is posed once.
     fn write_frames(&self, folder: &Path, file: &MeshFile<'_>) -> Result<()> {
-        let is_written = |number: u64| self.args.sequence || self.args.frame.is_some() || number.is_multiple_of(SURFACE_EVERY);
+        let is_written =
+            |number: u64| self.args.sequence || self.args.frame.is_some() || number.is_multiple_of(SURFACE_EVERY);
         if self.source.numbers.iter().any(|number| is_written(*number)) {
             std::fs::create_dir(folder.join("surface"))?;
         }
