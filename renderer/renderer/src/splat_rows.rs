@@ -136,7 +136,7 @@ fn project(
         + columns[2].perp_dot(columns[0]).powi(2);
     let s = f64::from(settings.filter_variance_px2);
     let (xx, yy, filtered) = (xx + s, yy + s, det + s * (xx + yy) + s * s);
-    let opacity = (det / filtered).sqrt();
+    let opacity = if settings.filter_keeps_opacity { 1.0 } else { (det / filtered).sqrt() };
     if opacity.is_nan() || opacity <= CUT || !filtered.is_finite() {
         return None;
     }

@@ -35,11 +35,21 @@ fn render<'a>(
 }
 
 fn check(gpu: &GpuContext, name: &str, rasterizer: &mut Rasterizer, scene: &Ellipsoids, camera: &Camera) -> f64 {
-    let settings = RasterSettings::default();
-    let ours = render(gpu, rasterizer, &upload(gpu, scene).unwrap(), camera, &settings);
+    check_with(&RasterSettings::default(), gpu, name, rasterizer, scene, camera)
+}
+
+fn check_with(
+    settings: &RasterSettings,
+    gpu: &GpuContext,
+    name: &str,
+    rasterizer: &mut Rasterizer,
+    scene: &Ellipsoids,
+    camera: &Camera,
+) -> f64 {
+    let ours = render(gpu, rasterizer, &upload(gpu, scene).unwrap(), camera, settings);
     assert!(ours.is_finite(), "{name}: not finite");
     let (width, height) = (camera.intrinsics.width, camera.intrinsics.height);
-    let expected = scene.render(camera, &settings, width, height);
+    let expected = scene.render(camera, settings, width, height);
     let d = Difference::between(&ours, &expected);
     println!(
         "{name:44} max {:.1e} mean {:.1e} | depth max {:.1e} | mean alpha {:.2}",
@@ -79,6 +89,37 @@ fn random_scenes_agree_with_the_reference_for_every_lens_and_order() {
             }
         }
         println!("{scenes} scenes on {}: mean error {:.2e}", gpu.adapter_name(), mean / scenes);
+    });
+}
+
+#[test]
+fn the_classic_filter_agrees_with_the_reference() {
+    on_both(|gpu| {
+        let settings = RasterSettings::default().with_classic_filter();
+        let mut rasterizer = Rasterizer::new(gpu, 16).unwrap();
+        let mut rng = StdRng::seed_from_u64(7);
+        for (round, lens) in LENSES.into_iter().enumerate() {
+            let mut scene = random_ellipsoids(&mut rng, 400, HarmonicOrder::ALL[round % 3]);
+            // Far below a pixel, where the filter decides on the opacity.
+            scene.scale_opacity.iter_mut().step_by(2).for_each(|s| (0..3).for_each(|k| s[k] *= 0.01));
+            if round % 2 == 1 {
+                poison(&mut rng, &mut scene);
+            }
+            let camera = random_camera(&mut rng, lens, 90, 70);
+            check_with(&settings, gpu, &format!("classic {round}"), &mut rasterizer, &scene, &camera);
+        }
+        // A Gaussian below a pixel keeps its opacity, which Mip-Splatting's filter spreads.
+        let mut one = random_ellipsoids(&mut rng, 1, HarmonicOrder::Zero);
+        one.center[0] = [0.0; 4];
+        one.scale_opacity[0] = [1e-4, 1e-4, 1e-4, 0.9];
+        let camera = straight(Lens::PINHOLE, 9, 9);
+        let mut alpha = |settings: &RasterSettings| -> f32 {
+            let image = render(gpu, &mut rasterizer, &upload(gpu, &one).unwrap(), &camera, settings);
+            image.color.iter().map(|color| color[3]).sum()
+        };
+        let (classic, mip) = (alpha(&settings), alpha(&RasterSettings::default()));
+        let integral = 0.9 * 2.0 * std::f32::consts::PI * 0.3;
+        assert!((classic - integral).abs() < 0.2 && mip < 0.1, "{classic} {mip}");
     });
 }
 

@@ -22,6 +22,7 @@ const SETTINGS: RasterSettings = RasterSettings {
     cull_backfacing: false,
     outputs: Outputs { depth: true, ..Outputs::PLANES },
     filter_variance_px2: 0.1,
+    filter_keeps_opacity: false,
     area: None,
 };
 

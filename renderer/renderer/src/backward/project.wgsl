@@ -121,12 +121,15 @@ fn project_backward(@builtin(workgroup_id) group: vec3<u32>, @builtin(num_workgr
     let filtered_det = det + s * (xx + yy) + s * s;
     // Inverse covariances after and before the filter.
     let filtered_inverse = mat2x2(yy + s, -xy, -xy, xx + s) * (1.0 / filtered_det);
-    let plain_inverse = mat2x2(yy, -xy, -xy, xx) * (1.0 / det);
+    // An opacity that the filter keeps does not depend on the covariance.
+    let is_kept = frame.filter_keeps_opacity != 0u;
+    let by_opacity = select(s, 0.0, is_kept);
+    let plain_inverse = mat2x2(yy, -xy, -xy, xx) * (1.0 / select(det, 1.0, is_kept));
     let d_pixel = filtered_inverse * sums_a.yz * (2.0 * HALF_LOG2_E);
     // dL/d covariance: through the conic, and through the opacity sqrt(det / filtered_det).
     let moments = mat2x2(sums_b.x, sums_b.y, sums_b.y, sums_b.z);
     let d_covariance =
-        (filtered_inverse * moments * filtered_inverse + plain_inverse * filtered_inverse * (s * sums_a.x)) * HALF_LOG2_E;
+        (filtered_inverse * moments * filtered_inverse + plain_inverse * filtered_inverse * (by_opacity * sums_a.x)) * HALF_LOG2_E;
     // dL/d the columns of the projection's Jacobian J.
     // only isotropic
     // Covariance = scale^2 J J^T.

@@ -3,6 +3,7 @@
 use std::fs;
 
 use super::*;
+use crate::anisotropic::order::HarmonicOrder;
 
 fn splats(order: HarmonicOrder, count: usize) -> AnisotropicSplats {
     let mut splats = AnisotropicSplats::empty(order);
@@ -99,12 +100,15 @@ fn damaged_files_are_refused_with_a_reason() {
     assert!(matches!(refused(&text("vertex 3", "vertex 18446744073709551615")), PlyError::Short { .. }));
     assert!(matches!(refused(&text("vertex 3", "vertex -3")), PlyError::Header(_)));
     assert!(matches!(refused(&text("binary_little_endian", "ascii")), PlyError::Header(_)));
-    assert!(matches!(refused(&text("float x", "double x")), PlyError::Header(_)));
+    assert!(matches!(refused(&text("float x", "double x")), PlyError::Short { gaussians: 3, .. }));
     assert!(matches!(refused(&text("float x", "list uchar int x")), PlyError::Header(_)));
     assert!(matches!(refused(&text("f_rest_8", "f_else_8")), PlyError::Header(_)));
     assert_eq!(refused(&text("rot_2", "rot_9")), PlyError::Missing("rot_2".to_owned()));
     assert!(matches!(refused(b"ply\n\xff\xfe\n"), PlyError::NoEnd));
-    assert!(matches!(refused(b"ply\nformat binary_little_endian 1.0\nelement face 1\n"), PlyError::Header(_)));
+    assert!(matches!(
+        refused(b"ply\nformat binary_little_endian 1.0\nelement face 1\nend_header\n"),
+        PlyError::Header(_)
+    ));
     assert_eq!(refused(&[b'x'; 1 << 17]), PlyError::NoEnd);
     let nothing = b"ply\nformat binary_little_endian 1.0\nelement vertex 4294967296\nend_header\n";
     assert!(matches!(refused(nothing), PlyError::Missing(_)));

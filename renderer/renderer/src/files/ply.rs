@@ -42,7 +42,7 @@ pub(crate) fn write_ply<'a, R: IntoIterator<Item = f32>>(
     rows: impl Iterator<Item = R>,
 ) -> Result<(), ExportError> {
     write_whole(path, |out| {
-        write!(out, "ply\nformat binary_little_endian 1.0\nelement vertex {count}\n")?;
+        write!(out, "ply\nformat binary_little_endian 1.0\ncomment SplatRenderMode: mip\nelement vertex {count}\n")?;
         for property in properties {
             writeln!(out, "property float {property}")?;
         }

@@ -100,7 +100,8 @@ impl DeviceRasterizer {
             pair_capacity: layout.pair_capacity,
             near_m: settings.near_m,
             filter_variance_px2: settings.filter_variance_px2,
-            unused: [0; 2],
+            filter_keeps_opacity: settings.filter_keeps_opacity.into(),
+            unused: 0,
             first_tile,
             unused_too: [0; 2],
         };

@@ -10,7 +10,9 @@ struct Frame {
     pair_capacity: u32,
     near_m: f32,
     filter_variance_px2: f32,
-    unused: vec2<u32>,
+    // Whether splats keep their opacity under the filter.
+    filter_keeps_opacity: u32,
+    unused: u32,
     // First of the tiles that are blended; the others keep their content.
     first_tile: vec2<u32>,
     unused_too: vec2<u32>,

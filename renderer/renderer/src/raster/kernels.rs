@@ -88,7 +88,8 @@ pub(crate) struct FrameConstants {
     pub pair_capacity: u32,
     pub near_m: f32,
     pub filter_variance_px2: f32,
-    pub unused: [u32; 2],
+    pub filter_keeps_opacity: u32,
+    pub unused: u32,
     pub first_tile: [u32; 2],
     pub unused_too: [u32; 2],
 }

@@ -82,10 +82,12 @@ fn project(@builtin(workgroup_id) group: vec3<u32>, @builtin(num_workgroups) gro
     // det(J J^T) by the Cauchy-Binet formula: never negative, no cancellation for thin ellipses.
     let normal_of_rows = cross(row_x, row_y);
     let det = dot(normal_of_rows, normal_of_rows);
-    // Mip-Splatting's 2D Mip filter (Yu et al. 2024, Eq. 10): a wider ellipse of the same integral.
+    // Mip-Splatting's 2D Mip filter (Yu et al. 2024, Eq. 10): a wider ellipse of the same integral,
+    // or of the same opacity.
     let s = frame.filter_variance_px2;
     let filtered_det = det + s * (xx + yy) + s * s;
-    let opacity = min(own_opacity, 1.0) * sqrt(det / filtered_det);
+    let kept = select(sqrt(det / filtered_det), 1.0, frame.filter_keeps_opacity != 0u);
+    let opacity = min(own_opacity, 1.0) * kept;
     if !finite(vec4(projected.pixel, filtered_det, opacity)) || !(opacity > CUT) {
         return;
     }

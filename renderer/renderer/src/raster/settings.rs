@@ -40,9 +40,12 @@ pub struct RasterSettings {
     /// Images to write.
     pub outputs: Outputs,
     /// Variance of the low-pass filter that is added to every splat on the screen, square pixels. The splat's opacity
-    /// decreases so that its integral is preserved: Mip-Splatting's 2D Mip filter (Yu et al. 2024, Eq. 10). 0.1 is that
+    /// decreases so that its integral is preserved, unless [`Self::filter_keeps_opacity`] is set: Mip-Splatting's 2D Mip filter (Yu et al. 2024, Eq. 10). 0.1 is that
     /// paper's value for one pixel.
     pub filter_variance_px2: f32,
+    /// Whether splats keep their opacity when the filter widens them, so that small ones cover more than their integral: as the
+    /// 3D Gaussian Splatting reference code draws. The default is `false`.
+    pub filter_keeps_opacity: bool,
     /// Part of the image whose tiles are blended, `[left, top, right, bottom]` in pixels, right and bottom excluded;
     /// all other tiles keep their content. `None`: the whole image.
     pub area: Option<[u32; 4]>,
@@ -50,11 +53,24 @@ pub struct RasterSettings {
 
 impl Default for RasterSettings {
     fn default() -> Self {
-        Self { near_m: 0.05, cull_backfacing: true, outputs: Outputs::ALL, filter_variance_px2: 0.1, area: None }
+        Self {
+            near_m: 0.05,
+            cull_backfacing: true,
+            outputs: Outputs::ALL,
+            filter_variance_px2: 0.1,
+            filter_keeps_opacity: false,
+            area: None,
+        }
     }
 }
 
 impl RasterSettings {
+    /// Returns these settings with the filter of the 3D Gaussian Splatting reference code: 0.3 px² at the full opacity.
+    #[must_use]
+    pub fn with_classic_filter(self) -> Self {
+        Self { filter_variance_px2: 0.3, filter_keeps_opacity: true, ..self }
+    }
+
     /// Returns the settings that apply to this kind of Gaussians, drawn to this target.
     pub(crate) fn for_kind(&self, gaussians: Gaussians<'_>, target: &RenderTarget) -> Self {
         let has_planes = target.planes.as_ref().is_some_and(|planes| planes.len() >= target.color.len());

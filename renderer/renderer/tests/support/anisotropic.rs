@@ -86,7 +86,8 @@ impl Ellipsoid {
         let det = [(0, 1), (1, 2), (2, 0)].map(|(i, j)| columns[i].perp_dot(columns[j]).powi(2)).iter().sum::<f64>();
         let s = f64::from(settings.filter_variance_px2);
         let filtered_det = det + s * (xx + yy) + s * s;
-        let opacity = self.opacity.min(1.0) * (det / filtered_det).sqrt();
+        let kept = if settings.filter_keeps_opacity { 1.0 } else { (det / filtered_det).sqrt() };
+        let opacity = self.opacity.min(1.0) * kept;
         let overflows = filtered_det > f64::from(f32::MAX);
         (opacity > 1.0 / 255.0 && !overflows).then(|| Splat {
             index,

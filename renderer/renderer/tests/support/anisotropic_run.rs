@@ -116,7 +116,8 @@ pub fn random_round(rng: &mut StdRng, kernels: &mut Kernels<'_>, round: usize) -
         poison(rng, &mut scene);
     }
     scene.clear_of_clamp(&camera);
-    let settings = RasterSettings::default();
+    let mip = RasterSettings::default();
+    let settings = if round % 5 == 4 { mip.with_classic_filter() } else { mip };
     let touched = touched_by(scene.splats(&camera, &settings), (width, height));
     let mut incoming = random_incoming(rng, (width * height) as usize);
     incoming.only_clear(&touched.unclear);

@@ -87,7 +87,8 @@ pub fn splat_at(
     let s = f64::from(settings.filter_variance_px2);
     let det = (xx * yy - xy * xy).max(0.0);
     let filtered_det = (xx + s) * (yy + s) - xy * xy;
-    let opacity = opacity.min(1.0) * (det / filtered_det).sqrt();
+    let kept = if settings.filter_keeps_opacity { 1.0 } else { (det / filtered_det).sqrt() };
+    let opacity = opacity.min(1.0) * kept;
     // As the shader: what overflows f32 is not drawn.
     let overflows = filtered_det > f64::from(f32::MAX);
     (opacity > 1.0 / 255.0 && !overflows).then(|| Splat {

@@ -114,11 +114,15 @@ fn through_ellipse(rendered: &RasterImage, sums: &PairSum, [row_x, row_y]: [Vec3
     let filtered_det = det + s * (xx + yy) + s * s;
     // Inverse covariances after and before the filter.
     let filtered_inverse = Mat2::from_cols_array(&[yy + s, -xy, -xy, xx + s]) * (1.0 / filtered_det);
-    let plain_inverse = Mat2::from_cols_array(&[yy, -xy, -xy, xx]) * (1.0 / det);
+    // An opacity that the filter keeps does not depend on the covariance.
+    let is_kept = rendered.settings.filter_keeps_opacity;
+    let (by_opacity, plain_det) = if is_kept { (0.0, 1.0) } else { (s, det) };
+    let plain_inverse = Mat2::from_cols_array(&[yy, -xy, -xy, xx]) * (1.0 / plain_det);
     let d_pixel = filtered_inverse * Vec2::new(slope_x, slope_y) * (2.0 * HALF_LOG2_E);
     let moments = Mat2::from_cols_array(&[xx_moment, xy_moment, xy_moment, yy_moment]);
-    let d_covariance =
-        (filtered_inverse * moments * filtered_inverse + plain_inverse * filtered_inverse * (s * slope)) * HALF_LOG2_E;
+    let d_covariance = (filtered_inverse * moments * filtered_inverse
+        + plain_inverse * filtered_inverse * (by_opacity * slope))
+        * HALF_LOG2_E;
     (d_pixel, d_covariance)
 }
 

@@ -125,10 +125,12 @@ impl Projection<'_> {
         let (xx, xy, yy) = (row_x.dot(row_x), row_x.dot(row_y), row_y.dot(row_y));
         // det(J J^T) by the Cauchy-Binet formula: never negative, no cancellation for thin ellipses.
         let det = row_x.cross(row_y).length_squared();
-        // Mip-Splatting's 2D Mip filter (Yu et al. 2024, Eq. 10): a wider ellipse of the same integral.
+        // Mip-Splatting's 2D Mip filter (Yu et al. 2024, Eq. 10): a wider ellipse of the same integral,
+        // or of the same opacity.
         let s = self.settings.filter_variance_px2;
         let filtered_det = det + s * (xx + yy) + s * s;
-        let opacity = opacity.min(1.0) * (det / filtered_det).sqrt();
+        let kept = if self.settings.filter_keeps_opacity { 1.0 } else { (det / filtered_det).sqrt() };
+        let opacity = opacity.min(1.0) * kept;
         if !(pixel.is_finite() && filtered_det.is_finite() && opacity > CUT as f32) {
             return None;
         }
