@@ -135,7 +135,8 @@ pub enum Command {
         #[command(subcommand)]
         action: AvatarAction,
     },
-    /// Write the person of a take, or an avatar, as a closed mesh with texture and bones (glTF, USDZ, OBJ, 3MF, PLY).
+    /// Write the person of a take, or an avatar, as a closed mesh with texture and bones (glTF, USDZ, OBJ, 3MF, PLY); or the splats of
+    /// another tool (*.ply) as one without bones.
     Mesh(MeshArgs),
     /// Print the default configuration of the simulated rig, or export a simulated capture.
     Sim {

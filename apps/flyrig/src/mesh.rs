@@ -1,8 +1,9 @@
-//! `flyrig mesh`: the person of a take, or an avatar, as a closed mesh with bones.
+//! `flyrig mesh`: the person of a take, or an avatar, as a closed mesh with bones; or a splat file as one without.
 
 mod arguments;
 mod photos;
 mod source;
+mod splats;
 mod write;
 
 use std::{path::Path, time::Instant};
@@ -19,8 +20,6 @@ use write::{MeshFolder, partial_of};
 /// Runs the command.
 pub fn mesh(args: &MeshArgs, gpu: &dyn Fn() -> Result<GpuContext>) -> Result<()> {
     check_target(&args.out)?;
-    let source = Source::open(args, gpu)?;
-    let started = Instant::now();
     let mesh = MeshOptions {
         fusion: match args.fusion {
             FusionKind::Hgm => Fusion::Hgm,
@@ -29,6 +28,12 @@ pub fn mesh(args: &MeshArgs, gpu: &dyn Fn() -> Result<GpuContext>) -> Result<()>
         voxel_m: args.voxel,
         ..MeshOptions::default()
     };
+    if splats::is_splats(&args.take.dataset) {
+        return splats::mesh_file(args, mesh, gpu);
+    }
+    splats::check_no_splats(args)?;
+    let source = Source::open(args, gpu)?;
+    let started = Instant::now();
     let options = PersonOptions { mesh, triangles: args.triangles as usize, texture_side: args.texture };
     let (mut person, report) = MeshedPerson::of_avatar(&source.avatar, &options)
         .with_context(|| format!("no mesh of {}", args.take.dataset.display()))?;

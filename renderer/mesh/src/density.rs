@@ -63,7 +63,8 @@ pub fn median(mut values: Vec<f32>) -> f32 {
     if values.is_empty() { 0.0 } else { *values.select_nth_unstable_by(at, f32::total_cmp).1 }
 }
 
-fn first_spacing(positions: &[Vec3]) -> f32 {
+/// Returns a first estimate of the spacing from a sample of the positions; 0 without any.
+pub(crate) fn first_spacing(positions: &[Vec3]) -> f32 {
     let step = positions.len().div_ceil(SAMPLES).max(1);
     let spacing = |at: usize| {
         let own = positions[at];

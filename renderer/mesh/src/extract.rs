@@ -16,7 +16,7 @@ use crate::topology::Topology;
 use crate::winding::Winding;
 
 /// Smallest number of points that describe a person's surface.
-const MIN_POINTS: usize = 1000;
+pub(crate) const MIN_POINTS: usize = 1000;
 
 /// Options of [`mesh_from_points`].
 #[derive(Clone, Copy, Default)]

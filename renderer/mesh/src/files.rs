@@ -1,5 +1,6 @@
 //! Files of meshes for other programs. Every writer checks its input first and refuses it with one [`MeshFileError`].
 
+mod glb;
 mod mesh_file;
 mod obj;
 #[cfg(test)]
@@ -10,6 +11,7 @@ mod usd_skeleton;
 mod usd_text;
 mod usdz;
 
+pub use glb::write_glb;
 pub use mesh_file::{JointFrame, MeshFile, MeshFileError, MeshJoint, MeshSkeleton};
 pub use obj::write_obj;
 pub use threemf::write_3mf;

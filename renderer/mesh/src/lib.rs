@@ -11,7 +11,9 @@
 //! 5. [`keep_largest`]: removal of floaters and cavities.
 //!
 //! [`decimate`] simplifies the mesh, [`mesh_atlas`] gives it texture coordinates, and writers make files for other programs:
-//! [`write_obj`], [`write_3mf`], [`write_usdz`], [`write_usd_sequence`].
+//! [`write_glb`], [`write_obj`], [`write_3mf`], [`write_usdz`], [`write_usd_sequence`].
+//!
+//! [`mesh_splats`] runs all of this on Gaussians without a body, such as another tool's splat file.
 //!
 //! [`Topology`] verifies the result. [`skin_weights`] ties a mesh to a skeleton. [`Normalization`] brings Gaussians to unit size (HGM, Eq. 1) and back.
 //!
@@ -59,6 +61,7 @@ mod signs;
 mod skin;
 mod smooth;
 mod texture;
+mod splats;
 mod topology;
 mod triangle;
 mod union_find;
@@ -76,8 +79,8 @@ pub use extract::{MeshOptions, MeshReport, MeshSeconds, mesh_from_points};
 pub use fault::MeshFault;
 pub use field::{Evidence, Field, Voxel, fuse};
 pub use files::{
-    JointFrame, MeshFile, MeshFileError, MeshFrame, MeshJoint, MeshSkeleton, write_3mf, write_obj, write_usd_sequence,
-    write_usdz,
+    JointFrame, MeshFile, MeshFileError, MeshFrame, MeshJoint, MeshSkeleton, write_3mf, write_glb, write_obj,
+    write_usd_sequence, write_usdz,
 };
 pub use intersections::self_intersections;
 pub use marching_cubes::marching_cubes;
@@ -92,5 +95,6 @@ pub use texture::{
     DrawnMesh, Photo, PhotoError, PhotoInputs, PhotoSettings, PhotoTexture, Poser, TexturedMesh, draw_textured,
     photograph_texture,
 };
+pub use splats::{SplatCounts, SplatError, SplatMesh, SplatOptions, SplatReport, mesh_splats};
 pub use topology::Topology;
 pub use winding::Winding;

@@ -36,6 +36,30 @@ impl Dropped {
     }
 }
 
+/// Returns for each position whether it lies near the others: within the largest extent of their central 98 %, beyond which it lies
+/// along no axis.
+pub(crate) fn near_others(positions: &[Vec3]) -> Vec<bool> {
+    if positions.is_empty() {
+        return Vec::new();
+    }
+    let ranges: [(f64, f64); 3] = std::array::from_fn(|axis| {
+        let mut values: Vec<f32> = positions.iter().map(|position| position[axis]).collect();
+        let at = values.len() / 100;
+        let low = *values.select_nth_unstable_by(at, f32::total_cmp).1;
+        let last = values.len() - 1 - at;
+        let high = *values.select_nth_unstable_by(last, f32::total_cmp).1;
+        (f64::from(low), f64::from(high))
+    });
+    let extent = ranges.iter().map(|(low, high)| high - low).fold(0.0, f64::max);
+    let near = |position: &Vec3| {
+        (0..3).all(|axis| {
+            let value = f64::from(position[axis]);
+            (ranges[axis].0 - extent..=ranges[axis].1 + extent).contains(&value)
+        })
+    };
+    positions.iter().map(near).collect()
+}
+
 /// Valid surface points as columns of equal length: finite positions in metres, unit outward normals, positive weights.
 ///
 /// ```
@@ -91,25 +115,7 @@ impl OrientedPoints {
     /// Drops and counts points that lie further outside the central 98 % of the points, along any axis, than the largest
     /// extent of these: a few stray Gaussians must not decide on the size of the grid.
     pub fn drop_distant(&mut self) {
-        if self.positions.is_empty() {
-            return;
-        }
-        let ranges: [(f64, f64); 3] = std::array::from_fn(|axis| {
-            let mut values: Vec<f32> = self.positions.iter().map(|position| position[axis]).collect();
-            let at = values.len() / 100;
-            let low = *values.select_nth_unstable_by(at, f32::total_cmp).1;
-            let last = values.len() - 1 - at;
-            let high = *values.select_nth_unstable_by(last, f32::total_cmp).1;
-            (f64::from(low), f64::from(high))
-        });
-        let extent = ranges.iter().map(|(low, high)| high - low).fold(0.0, f64::max);
-        let near = |position: &Vec3| {
-            (0..3).all(|axis| {
-                let value = f64::from(position[axis]);
-                (ranges[axis].0 - extent..=ranges[axis].1 + extent).contains(&value)
-            })
-        };
-        let keep: Vec<bool> = self.positions.iter().map(near).collect();
+        let keep = near_others(&self.positions);
         self.dropped.distant += self.keep(&keep);
     }
 

@@ -4,12 +4,13 @@ use std::path::PathBuf;
 
 use clap::{Args, ValueEnum};
 
+use super::splats::{Unit, Up};
 use crate::arguments::DatasetArgs;
 
 /// Default number of Gaussians, as a rig draws.
-const GAUSSIANS: u32 = 115_000;
+pub(super) const GAUSSIANS: u32 = 115_000;
 /// Default steps of the fit.
-const STEPS: u64 = 400;
+pub(super) const STEPS: u64 = 400;
 
 /// Arguments of `flyrig mesh`.
 #[derive(Debug, Clone, Args)]
@@ -53,6 +54,12 @@ pub struct MeshArgs {
     /// Write the surface of every frame of a take, in place of every tenth, and of all frames as one USD file.
     #[arg(long)]
     pub sequence: bool,
+    /// Length unit of a splat file (*.ply); metres if not given.
+    #[arg(long, value_enum)]
+    pub unit: Option<Unit>,
+    /// Upward axis of a splat file, which becomes y; y if not given.
+    #[arg(long, value_enum, allow_hyphen_values = true)]
+    pub up: Option<Up>,
 }
 
 /// Light in a texture.

@@ -33,6 +33,24 @@ pub(super) fn partial_of(out: &Path) -> Result<PathBuf> {
     Ok(out.with_file_name(partial))
 }
 
+/// Writes a folder beside the target, which appears whole or not at all.
+///
+/// # Errors
+/// The error of `write_to`, or the folder cannot be created or renamed.
+pub(super) fn write_folder(out: &Path, write_to: impl FnOnce(&Path) -> Result<()>) -> Result<()> {
+    let partial = partial_of(out)?;
+    std::fs::create_dir(&partial).with_context(|| format!("cannot create {}", partial.display()))?;
+    if let Err(error) = write_to(&partial) {
+        // The first error is the one worth reporting.
+        let _ = std::fs::remove_dir_all(&partial);
+        return Err(error);
+    }
+    // An empty folder of this name may be there.
+    let _ = std::fs::remove_dir(out);
+    std::fs::rename(&partial, out)
+        .with_context(|| format!("cannot rename {} to {}; the mesh is in the former", partial.display(), out.display()))
+}
+
 /// Folder that is written.
 pub(super) struct MeshFolder<'a> {
     pub out: &'a Path,
@@ -48,21 +66,13 @@ pub(super) struct MeshFolder<'a> {
 }
 
 impl MeshFolder<'_> {
-    /// Writes all files to a folder beside the target, which appears whole or not at all.
+    /// Writes all files.
+    ///
+    /// # Errors
+    /// As [`write_folder`].
     pub fn write(&self) -> Result<()> {
         ensure!(!stop::requested(), "stopped; nothing was written");
-        let partial = partial_of(self.out)?;
-        std::fs::create_dir(&partial).with_context(|| format!("cannot create {}", partial.display()))?;
-        if let Err(error) = self.write_to(&partial) {
-            // The first error is the one worth reporting.
-            let _ = std::fs::remove_dir_all(&partial);
-            return Err(error);
-        }
-        // An empty folder of this name may be there.
-        let _ = std::fs::remove_dir(self.out);
-        std::fs::rename(&partial, self.out).with_context(|| {
-            format!("cannot rename {} to {}; the mesh is in the former", partial.display(), self.out.display())
-        })?;
+        write_folder(self.out, |folder| self.write_to(folder))?;
         self.print();
         Ok(())
     }

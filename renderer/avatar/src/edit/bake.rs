@@ -1,4 +1,4 @@
-//! Texture of any mesh near an avatar's surface, from its Gaussians.
+//! Texture of any mesh, from colours of its surface: those of an avatar's Gaussians for a mesh near its surface.
 
 use glam::{Vec2, Vec3};
 
@@ -6,10 +6,10 @@ use crate::edit::atlas::{Atlas, SIDES, UNUSED, each_texel, encode, grow};
 use crate::error::AvatarError;
 use crate::model::avatar::Avatar;
 
-/// Mesh in the rest pose with the take's mean shape. Lists of vertices have the same length.
+/// Mesh; in the rest pose with the take's mean shape for [`Avatar::bake`]. Lists of vertices have the same length.
 #[derive(Debug, Clone, Copy)]
 pub struct BakedMesh<'a> {
-    /// Canonical positions, metres.
+    /// Positions, metres; canonical for [`Avatar::bake`].
     pub positions: &'a [Vec3],
     /// Unit normals.
     pub normals: &'a [Vec3],
@@ -20,22 +20,36 @@ pub struct BakedMesh<'a> {
 }
 
 impl Avatar {
-    /// Renders the unlit colours of the Gaussians into a texture of a mesh. Triangles with vertices out of range are ignored; where two
-    /// triangles share a texel, the first one wins.
+    /// Renders the unlit colours of the Gaussians into a texture of a mesh, as [`BakedMesh::paint`] does.
+    ///
+    /// # Errors
+    /// As [`BakedMesh::paint`].
+    pub fn bake(&self, mesh: BakedMesh<'_>, side: u32) -> Result<Atlas, AvatarError> {
+        mesh.paint(side, |points| self.colors_at(points))
+    }
+}
+
+impl BakedMesh<'_> {
+    /// Renders a texture of the mesh. `colors` returns the linear RGB of points of its surface, given by position and unit normal.
+    /// Triangles with vertices out of range are ignored; where two triangles share a texel, the first one wins.
     ///
     /// # Errors
     /// [`AvatarError::Texture`] for a side outside of 16..=4096.
-    pub fn bake(&self, mesh: BakedMesh<'_>, side: u32) -> Result<Atlas, AvatarError> {
+    pub fn paint(
+        &self,
+        side: u32,
+        colors: impl FnOnce(&[(Vec3, Vec3)]) -> Vec<[f32; 3]>,
+    ) -> Result<Atlas, AvatarError> {
         if !SIDES.contains(&side) {
             let (least, most) = (SIDES.start(), SIDES.end());
             return Err(AvatarError::Texture(format!("a texture of {side} texels a side; choose {least} to {most}")));
         }
         let mut taken = vec![false; (side * side) as usize];
         let (mut texels, mut points) = (Vec::new(), Vec::new());
-        for triangle in mesh.triangles {
+        for triangle in self.triangles {
             let corners = triangle.map(|i| {
                 let i = i as usize;
-                Some((*mesh.positions.get(i)?, *mesh.normals.get(i)?, *mesh.uvs.get(i)?))
+                Some((*self.positions.get(i)?, *self.normals.get(i)?, *self.uvs.get(i)?))
             });
             let [Some(a), Some(b), Some(c)] = corners else { continue };
             let corners = [a, b, c];
@@ -51,7 +65,7 @@ impl Avatar {
             });
         }
         let mut image = vec![None; (side * side) as usize];
-        for (index, color) in texels.iter().zip(self.colors_at(&points)) {
+        for (index, color) in texels.iter().zip(colors(&points)) {
             image[*index] = Some(encode(Vec3::from(color)));
         }
         grow(&mut image, side as usize);

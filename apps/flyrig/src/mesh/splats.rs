@@ -1,0 +1,275 @@
+//! Meshes of splat files of other tools, which have no body: static ones, without bones.
+
+use std::{path::Path, time::Instant};
+
+use anyhow::{Context as _, Result, bail, ensure};
+use clap::ValueEnum;
+use flyrig_body::write_mesh_ply;
+use flyrig_gpu::GpuContext;
+use flyrig_mesh::{
+    MeshFile, MeshOptions, SplatMesh, SplatOptions, SplatReport, mesh_splats, write_3mf, write_glb, write_obj,
+    write_usdz,
+};
+use flyrig_renderer::{SplatFile, SplatFilter};
+use flyrig_report::{png, stop, write_whole};
+use glam::{Quat, Vec3};
+use serde_json::json;
+
+use super::arguments::{GAUSSIANS, MeshArgs, STEPS};
+use super::write::write_folder;
+
+/// Files of packed splats, which other programs unpack.
+const PACKED: [&str; 5] = ["spz", "sog", "splat", "ksplat", "lcc"];
+
+/// Length of a splat file's unit.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, ValueEnum)]
+pub enum Unit {
+    M,
+    Cm,
+    Mm,
+}
+
+impl Unit {
+    fn metres(self) -> f32 {
+        match self {
+            Self::M => 1.0,
+            Self::Cm => 0.01,
+            Self::Mm => 0.001,
+        }
+    }
+}
+
+/// Upward axis of a splat file.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, ValueEnum)]
+pub enum Up {
+    Y,
+    #[value(name = "-y")]
+    MinusY,
+    Z,
+    #[value(name = "-z")]
+    MinusZ,
+}
+
+impl Up {
+    /// Returns the rotation to y up. A file with y down turns about x, so that what faces the viewer in the usual axes of cameras, x right
+    /// and z forward, faces +z.
+    fn to_y(self) -> Quat {
+        use std::f32::consts::{FRAC_PI_2, PI};
+        match self {
+            Self::Y => Quat::IDENTITY,
+            Self::MinusY => Quat::from_rotation_x(PI),
+            Self::Z => Quat::from_rotation_x(-FRAC_PI_2),
+            Self::MinusZ => Quat::from_rotation_x(FRAC_PI_2),
+        }
+    }
+}
+
+/// Returns whether a path names splats and neither a take nor an avatar.
+pub(super) fn is_splats(path: &Path) -> bool {
+    let extension = extension(path);
+    extension == "ply" || PACKED.contains(&extension.as_str())
+}
+
+fn extension(path: &Path) -> String {
+    path.extension().map(|extension| extension.to_string_lossy().to_lowercase()).unwrap_or_default()
+}
+
+/// Meshes a splat file.
+///
+/// # Errors
+/// The file holds no Gaussians of one person, an option does not apply to splats, or a file cannot be written.
+pub(super) fn mesh_file(args: &MeshArgs, mesh: MeshOptions<'_>, gpu: &dyn Fn() -> Result<GpuContext>) -> Result<()> {
+    let path = &args.take.dataset;
+    check_options(args)?;
+    if PACKED.contains(&extension(path).as_str()) {
+        bail!(
+            "{} is packed; unpack it: splat-transform {} {}",
+            path.display(),
+            path.display(),
+            path.with_extension("ply").display()
+        );
+    }
+    let bytes = std::fs::read(path).with_context(|| format!("cannot read {}", path.display()))?;
+    let file = SplatFile::parse(&bytes).with_context(|| format!("no mesh of {}", path.display()))?;
+    drop(bytes);
+    let options = SplatOptions {
+        unit_m: args.unit.map_or(1.0, Unit::metres),
+        filter: file.filter,
+        mesh,
+        triangles: args.triangles as usize,
+        texture_side: args.texture,
+    };
+    let started = Instant::now();
+    let (mesh, report) = mesh_splats(&file.splats, &gpu()?.fastest(), &options)
+        .with_context(|| format!("no mesh of {}", path.display()))?;
+    let seconds = started.elapsed().as_secs_f64();
+    ensure!(!stop::requested(), "stopped; nothing was written");
+    let written = Written { args, file: &file, mesh: &mesh, report: &report, seconds };
+    write_folder(&args.out, |folder| written.write_to(folder))?;
+    written.print();
+    Ok(())
+}
+
+/// Checks that no option of takes is given.
+fn check_options(args: &MeshArgs) -> Result<()> {
+    let take = &args.take;
+    let given = [
+        ("--inputs", !take.inputs.is_empty()),
+        ("--frames", take.range.frames.is_some()),
+        ("--pose or --masks", take.perception.is_named()),
+        ("--sequence", args.sequence),
+        ("--steps", args.steps != STEPS),
+        ("--gaussians", args.gaussians != GAUSSIANS),
+        ("--lag", !take.lags.by_camera.is_empty()),
+        ("--trust-calibration", take.trust.trust_calibration),
+    ];
+    let given: Vec<&str> = given.iter().filter(|(_, given)| *given).map(|(name, _)| *name).collect();
+    ensure!(
+        given.is_empty(),
+        "{} is a splat file and not a take: leave out {}",
+        take.dataset.display(),
+        given.join(" and ")
+    );
+    Ok(())
+}
+
+/// Checks that no option of splat files is given for another source.
+pub(super) fn check_no_splats(args: &MeshArgs) -> Result<()> {
+    ensure!(
+        args.unit.is_none() && args.up.is_none(),
+        "{} is no splat file (*.ply): leave out --unit and --up",
+        args.take.dataset.display()
+    );
+    Ok(())
+}
+
+/// Mesh that is written.
+struct Written<'a> {
+    args: &'a MeshArgs,
+    file: &'a SplatFile,
+    mesh: &'a SplatMesh,
+    report: &'a SplatReport,
+    seconds: f64,
+}
+
+impl Written<'_> {
+    fn write_to(&self, folder: &Path) -> Result<()> {
+        let SplatMesh { positions, normals, uvs, triangles, texture } = self.mesh;
+        // In the file's own axes, metres.
+        std::fs::create_dir(folder.join("surface"))?;
+        write_mesh_ply(&folder.join("surface/000000.ply"), positions, normals, triangles, &[])?;
+        let turn = self.args.up.unwrap_or(Up::Y).to_y();
+        let turned = |vectors: &[Vec3]| -> Vec<Vec3> { vectors.iter().map(|vector| turn * *vector).collect() };
+        let (positions, normals) = (turned(positions), turned(normals));
+        let image = png::encode_rgb(&texture.rgb, texture.side, texture.side)?;
+        let mesh = MeshFile {
+            positions: &positions,
+            normals: &normals,
+            uvs,
+            triangles,
+            texture: Some(&image),
+            skeleton: None,
+        };
+        write_glb(&folder.join("mesh.glb"), &mesh)?;
+        write_obj(&folder.join("mesh.obj"), &mesh)?;
+        write_usdz(&folder.join("mesh.usdz"), &mesh)?;
+        write_3mf(&folder.join("mesh.3mf"), &mesh)?;
+        write_whole(&folder.join("metrics.json"), &serde_json::to_vec_pretty(&self.metrics())?)
+    }
+
+    fn metrics(&self) -> serde_json::Value {
+        let (report, mesh, counts) = (self.report, &self.report.mesh, &self.report.counts);
+        let (topology, seconds, [viewed_s, simplified_s, textured_s]) =
+            (&report.topology, &mesh.seconds, report.seconds);
+        json!({
+            "splats": self.args.take.dataset.display().to_string(),
+            "harmonics_degree": self.file.degree,
+            "flat_gaussians": self.file.is_flat,
+            "filter": match self.file.filter { SplatFilter::Classic => "classic", SplatFilter::Mip => "mip" },
+            "gaussians": counts.used,
+            "rows_left_out": self.file.left_out,
+            "invalid": counts.not_finite,
+            "transparent": counts.transparent,
+            "distant": counts.distant,
+            "clamped": counts.clamped,
+            "spacing_mm": 1e3 * report.spacing_m,
+            "views": report.views[0],
+            "view_pixels": report.views[1],
+            "pixel_mm": 1e3 * report.pixel_m,
+            "points": mesh.points,
+            "dropped_points": mesh.dropped.total(),
+            "vertices": topology.vertices,
+            "triangles": topology.triangles,
+            "closed_manifold": topology.is_closed_manifold(),
+            "components": topology.components,
+            "genus": topology.genus(),
+            "self_intersections": topology.self_intersections,
+            "area_m2": topology.area_m2,
+            "volume_m3": topology.volume_m3,
+            "fused_triangles": mesh.topology.triangles,
+            "removed_components": mesh.removed.volumes_m3.len(),
+            "simplified_by_mm": 1e3 * report.simplified_by_m,
+            "charts": report.charts,
+            "texture_coverage": report.coverage,
+            "unseen_texels": report.unseen_texels,
+            "hole_share": mesh.hole_share,
+            "carved_voxels": mesh.emptied_voxels,
+            "voxel_mm": 1e3 * mesh.settings.voxel_m,
+            "truncation_mm": 1e3 * mesh.settings.truncation_m,
+            "angle_rad": mesh.settings.angle_rad,
+            "decay_mm": 1e3 * mesh.settings.decay_m,
+            "blocks": mesh.blocks,
+            "skipped_blocks": mesh.skipped_blocks,
+            "seconds": {
+                "views": viewed_s,
+                "density": seconds.density,
+                "fusion": seconds.fuse,
+                "signs": seconds.signs,
+                "carving": seconds.carve,
+                "surface": seconds.surface,
+                "components": seconds.components,
+                "topology": seconds.topology,
+                "simplification": simplified_s,
+                "texture": textured_s,
+                "all": self.seconds,
+            },
+        })
+    }
+
+    fn print(&self) {
+        let (report, mesh) = (self.report, &self.report.mesh);
+        println!(
+            "{} triangles from {} Gaussians ({} rows left out) at voxels of {:.1} mm in {:.1} s; {:.1} % of the surface closes holes; {}",
+            report.topology.triangles,
+            report.counts.used,
+            self.file.left_out + report.counts.not_finite,
+            1e3 * mesh.settings.voxel_m,
+            self.seconds,
+            100.0 * mesh.hole_share,
+            self.args.out.join("mesh.glb").display()
+        );
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn the_upward_axis_becomes_y() {
+        let axes = [(Up::Y, Vec3::Y), (Up::MinusY, Vec3::NEG_Y), (Up::Z, Vec3::Z), (Up::MinusZ, Vec3::NEG_Z)];
+        for (up, axis) in axes {
+            assert!((up.to_y() * axis).distance(Vec3::Y) < 1e-6, "{up:?}");
+        }
+    }
+
+    #[test]
+    fn splats_are_known_by_their_extension() {
+        for name in ["a.ply", "a.PLY", "b.spz", "c.sog", "d.splat"] {
+            assert!(is_splats(Path::new(name)), "{name}");
+        }
+        for name in ["take", "a.flyavatar", "a.mcap", "ply"] {
+            assert!(!is_splats(Path::new(name)), "{name}");
+        }
+    }
+}
