@@ -196,6 +196,7 @@ impl Written<'_> {
             "views": report.views[0],
             "view_pixels": report.views[1],
             "pixel_mm": 1e3 * report.pixel_m,
+            "drawn_beyond_mm": 1e3 * report.drawn_beyond_m,
             "points": mesh.points,
             "dropped_points": mesh.dropped.total(),
             "vertices": topology.vertices,

@@ -1,8 +1,9 @@
 //! Closed, textured mesh of free Gaussians, such as another tool's splat file.
 //!
 //! No body says which side of a Gaussian is outside. Virtual cameras on all sides do: their pixels become points of the surface that
-//! faces them (`views`), what they look through is empty ([`carve`](crate::carve)), and their images give the texture (`paint`).
+//! faces them (`views`), moved to where their contours lie (`contour`), what they look through is empty ([`carve`](crate::carve)), and their images give the texture (`paint`).
 
+mod contour;
 mod error;
 mod paint;
 mod prepare;
@@ -15,6 +16,7 @@ use flyrig_gpu::GpuContext;
 use flyrig_renderer::{AnisotropicSplats, SplatFilter};
 use glam::{Vec2, Vec3};
 
+use crate::splats::contour::{drawn_beyond_m, move_outwards};
 use crate::splats::{paint::Painter, prepare::prepare, views::render};
 use crate::{AtlasSettings, MeshOptions, MeshReport, OrientedPoints, Topology, decimate, mesh_atlas, mesh_from_points};
 
@@ -75,6 +77,8 @@ pub struct SplatReport {
     pub views: [u32; 2],
     /// Width of a pixel at the centre of the Gaussians, metres.
     pub pixel_m: f32,
+    /// Distance from the planes of the Gaussians to the surface that they draw, along the normals, metres.
+    pub drawn_beyond_m: f32,
     /// Topology of the simplified mesh.
     pub topology: Topology,
     /// Mean distance of the simplified mesh from the fused one, metres.
@@ -118,11 +122,13 @@ pub fn mesh_splats(
 ) -> Result<(SplatMesh, SplatReport), SplatError> {
     let prepared = prepare(splats, options.unit_m)?;
     let started = Instant::now();
-    let (views, rows) = render(gpu, &prepared, options.filter)?;
+    let (views, mut rows) = render(gpu, &prepared, options.filter)?;
+    let drawn_beyond_m = drawn_beyond_m(&views, &rows, &prepared);
+    move_outwards(&mut rows, drawn_beyond_m);
     let viewed_s = started.elapsed().as_secs_f64();
 
     let voxel_m = options.mesh.voxel_m.unwrap_or(VOXEL * prepared.spacing_m);
-    let margin = (2.0 * voxel_m / prepared.unit.scale_m() as f32).max(1e-6);
+    let margin = ((2.0 * voxel_m + drawn_beyond_m) / prepared.unit.scale_m() as f32).max(1e-6);
     let empty = |place: Vec3| {
         let place = prepared.unit.normalized(place).as_vec3();
         views.iter().filter(|view| view.sees_through(place, margin)).nth(VOTES - 1).is_some()
@@ -148,6 +154,7 @@ pub fn mesh_splats(
         spacing_m: prepared.spacing_m,
         views: [views.len() as u32, views.first().map_or(0, |view| view.side)],
         pixel_m: views.first().map_or(0.0, |view| view.pixel * prepared.unit.scale_m() as f32),
+        drawn_beyond_m,
         topology: Topology::measure(&simple.mesh),
         simplified_by_m: simple.mean_distance_m,
         charts: atlas.charts,

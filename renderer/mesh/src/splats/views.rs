@@ -27,7 +27,9 @@ const EMPTY: f32 = 0.1;
 /// Least cosine between the normal and the line of sight of a point, and of a colour.
 const GRAZING: f32 = 0.2;
 const COLOR_GRAZING: f32 = 0.3;
-/// Exponent of that cosine in the weight of a colour: the views that face the surface decide.
+/// Largest cosine between normal and line of sight at a contour.
+const CONTOUR: f32 = 0.1;
+/// Exponent of the cosine in the weight of a colour: the views that face the surface decide.
 const SHARPNESS: i32 = 8;
 
 /// Image of a virtual camera, a pinhole with square pixels.
@@ -191,6 +193,32 @@ impl View {
         let Some((depth, around)) = self.project(place) else { return false };
         let alpha: f32 = around.iter().map(|(i, weight)| self.alpha[*i] * weight).sum();
         alpha < EMPTY || around.iter().all(|(i, _)| self.depth[*i] > 0.0 && depth < self.depth[*i] - margin)
+    }
+
+    /// Returns the distance along the unit normal from a point at the contour of the surface to where alpha falls below one half, unit
+    /// size. `None` where the camera sees the point face-on or behind another surface by more than `tolerance`, and where alpha does not
+    /// fall within `farthest`.
+    pub fn to_contour(&self, place: Vec3, normal: Vec3, farthest: f32, tolerance: f32) -> Option<f32> {
+        let sight = (place - self.eye()).normalize_or_zero();
+        if normal.dot(sight).abs() > CONTOUR {
+            return None;
+        }
+        let (depth, around) = self.project(place)?;
+        if around.iter().any(|(i, _)| self.depth[*i] > 0.0 && depth > self.depth[*i] + 4.0 * tolerance) {
+            return None;
+        }
+        let step = 0.5 * self.pixel;
+        let mut before: f32 = 1.0;
+        for k in 0..=(farthest / step) as usize {
+            let (_, around) = self.project(place + normal * (k as f32 * step))?;
+            let alpha: f32 = around.iter().map(|(i, weight)| self.alpha[*i] * weight).sum();
+            if alpha < SOLID {
+                let part = (before - SOLID) / (before - alpha).max(1e-6);
+                return Some((k as f32 - 1.0 + part).max(0.0) * step);
+            }
+            before = alpha;
+        }
+        None
     }
 
     /// Returns the linear colour of a point of the surface, given by place and unit normal, and its weight. `None` where the camera does
