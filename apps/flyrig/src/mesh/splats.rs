@@ -178,9 +178,15 @@ impl Written<'_> {
     }
 
     fn metrics(&self) -> serde_json::Value {
-        let (report, mesh, counts) = (self.report, &self.report.mesh, &self.report.counts);
-        let (topology, seconds, [viewed_s, simplified_s, textured_s]) =
-            (&report.topology, &mesh.seconds, report.seconds);
+        let mut metrics = self.of_gaussians();
+        if let (Some(all), Some(more)) = (metrics.as_object_mut(), self.of_surface().as_object_mut()) {
+            all.append(more);
+        }
+        metrics
+    }
+
+    fn of_gaussians(&self) -> serde_json::Value {
+        let (report, counts) = (self.report, &self.report.counts);
         json!({
             "splats": self.args.take.dataset.display().to_string(),
             "harmonics_degree": self.file.degree,
@@ -197,6 +203,14 @@ impl Written<'_> {
             "view_pixels": report.views[1],
             "pixel_mm": 1e3 * report.pixel_m,
             "drawn_beyond_mm": 1e3 * report.drawn_beyond_m,
+        })
+    }
+
+    fn of_surface(&self) -> serde_json::Value {
+        let (report, mesh) = (self.report, &self.report.mesh);
+        let (topology, seconds, [viewed_s, simplified_s, textured_s]) =
+            (&report.topology, &mesh.seconds, report.seconds);
+        json!({
             "points": mesh.points,
             "dropped_points": mesh.dropped.total(),
             "vertices": topology.vertices,

@@ -3,13 +3,12 @@
 //! Centres of fitted Gaussians lie below the surface that they draw, by up to several deviations. The images show it at their contours,
 //! which are what was compared with photographs: there, alpha falls below one half outside of the points that the planes give.
 
-use glam::Vec3;
 use rayon::prelude::*;
 
-use crate::OrientedPoint;
 use crate::density::median;
 use crate::splats::prepare::Prepared;
 use crate::splats::views::View;
+use crate::{OrientedPoint, TriMesh};
 
 /// Largest distance, in distances of neighbouring Gaussians.
 const FARTHEST: f32 = 6.0;
@@ -33,8 +32,8 @@ pub(super) fn drawn_beyond_m(views: &[View], points: &[OrientedPoint], prepared:
     if found.len() < ENOUGH { 0.0 } else { median(found) * scale }
 }
 
-/// Moves points along their normals.
-pub(super) fn move_outwards(points: &mut [OrientedPoint], distance_m: f32) {
-    let moved = |point: &OrientedPoint| -> Vec3 { point.position + point.normal * distance_m };
-    points.iter_mut().for_each(|point| point.position = moved(point));
+/// Moves the vertices of a mesh along their normals. Points moved before the fusion grow onto each other in gaps.
+pub(super) fn move_outwards(mesh: &mut TriMesh, distance_m: f32) {
+    let normals = mesh.normals();
+    mesh.positions.iter_mut().zip(normals).for_each(|(position, normal)| *position += normal * distance_m);
 }

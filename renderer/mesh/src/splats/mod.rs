@@ -1,7 +1,8 @@
 //! Closed, textured mesh of free Gaussians, such as another tool's splat file.
 //!
 //! No body says which side of a Gaussian is outside. Virtual cameras on all sides do: their pixels become points of the surface that
-//! faces them (`views`), moved to where their contours lie (`contour`), what they look through is empty ([`carve`](crate::carve)), and their images give the texture (`paint`).
+//! faces them (`views`), what they look through is empty ([`carve`](crate::carve)), and their images give the texture (`paint`).
+//! The mesh moves from the planes of the Gaussians to the surface that they draw, as contours show it (`contour`).
 
 mod contour;
 mod error;
@@ -122,19 +123,19 @@ pub fn mesh_splats(
 ) -> Result<(SplatMesh, SplatReport), SplatError> {
     let prepared = prepare(splats, options.unit_m)?;
     let started = Instant::now();
-    let (views, mut rows) = render(gpu, &prepared, options.filter)?;
+    let (views, rows) = render(gpu, &prepared, options.filter)?;
     let drawn_beyond_m = drawn_beyond_m(&views, &rows, &prepared);
-    move_outwards(&mut rows, drawn_beyond_m);
     let viewed_s = started.elapsed().as_secs_f64();
 
     let voxel_m = options.mesh.voxel_m.unwrap_or(VOXEL * prepared.spacing_m);
-    let margin = ((2.0 * voxel_m + drawn_beyond_m) / prepared.unit.scale_m() as f32).max(1e-6);
+    let margin = (2.0 * voxel_m / prepared.unit.scale_m() as f32).max(1e-6);
     let empty = |place: Vec3| {
         let place = prepared.unit.normalized(place).as_vec3();
         views.iter().filter(|view| view.sees_through(place, margin)).nth(VOTES - 1).is_some()
     };
     let mesh_options = MeshOptions { voxel_m: Some(voxel_m), empty: Some(&empty), ..options.mesh };
-    let (fused, mesh) = mesh_from_points(OrientedPoints::from_rows(rows), &mesh_options)?;
+    let (mut fused, mesh) = mesh_from_points(OrientedPoints::from_rows(rows), &mesh_options)?;
+    move_outwards(&mut fused, drawn_beyond_m);
 
     let started = Instant::now();
     let simple = decimate(&fused, options.triangles)?;

@@ -72,7 +72,8 @@ fn a_sphere_of_gaussians_becomes_a_closed_sphere_with_its_colors() {
     }
     assert!(red > 100 && blue > 100, "{red} {blue}");
     assert!(unused * 50 < mesh.positions.len(), "{unused}");
-    assert!((0.0..0.004).contains(&report.drawn_beyond_m), "{}", report.drawn_beyond_m);
+    // Half a distance of neighbours.
+    assert!((0.0..0.009).contains(&report.drawn_beyond_m), "{}", report.drawn_beyond_m);
     assert!(report.unseen_texels * 100 < mesh.texture.covered, "{}", report.unseen_texels);
 
     // In millimetres, with the unit.

@@ -28,7 +28,7 @@ const EMPTY: f32 = 0.1;
 const GRAZING: f32 = 0.2;
 const COLOR_GRAZING: f32 = 0.3;
 /// Largest cosine between normal and line of sight at a contour.
-const CONTOUR: f32 = 0.1;
+const CONTOUR: f32 = 0.05;
 /// Exponent of the cosine in the weight of a colour: the views that face the surface decide.
 const SHARPNESS: i32 = 8;
 
