@@ -52,7 +52,8 @@ fn a_splat_file_becomes_a_closed_mesh_and_faults_are_refused() {
     let made = mesh(&["a.ply", "--out", "m"]);
     assert_eq!(made.code, Some(0), "{made:?}");
     let metrics: serde_json::Value = serde_json::from_slice(&fs::read(at("m/metrics.json")).unwrap()).unwrap();
-    let expected = [("closed_manifold", true.into()), ("components", 1.into()), ("rows_left_out", 3.into())];
+    let expected: [(&str, serde_json::Value); 3] =
+        [("closed_manifold", true.into()), ("components", 1.into()), ("rows_left_out", 3.into())];
     for (name, value) in expected {
         assert_eq!(metrics[name], value, "{metrics}");
     }
@@ -66,13 +67,16 @@ fn a_splat_file_becomes_a_closed_mesh_and_faults_are_refused() {
         let y: Vec<f32> = rows.map(|row| row.split(' ').nth(1).unwrap().parse().unwrap()).collect();
         y.iter().copied().fold(f32::MIN, f32::max) - y.iter().copied().fold(f32::MAX, f32::min)
     };
-    assert!((tall("m") - 1.2).abs() < 0.01, "{} m", tall("m"));
+    // Discs on the ellipsoid draw a surface outside of it; their planes stand out where it bends most.
+    let metres = |name: &str| 1e-3 * metrics[name].as_f64().unwrap() as f32;
+    let (drawn, voxel) = (2.0 * metres("drawn_beyond_mm"), metres("voxel_mm"));
+    assert!(drawn < 0.02 && (tall("m") - 1.2 - drawn).abs() < voxel, "{} m, {drawn} m drawn", tall("m"));
 
     // The same mesh from millimetres, and with another axis upwards.
     write(&at("mm.ply"), &[0.0], 4000, 0.001);
     let made = mesh(&["mm.ply", "--unit", "mm", "--up", "-z", "--out", "turned"]);
     assert_eq!(made.code, Some(0), "{made:?}");
-    assert!((tall("turned") - 0.3).abs() < 0.01, "{} m", tall("turned"));
+    assert!((tall("turned") - 0.3 - drawn).abs() < voxel, "{} m", tall("turned"));
 
     write(&at("ten.ply"), &[0.0], 10, 1.0);
     write(&at("two.ply"), &[0.0, 1.0], 2000, 1.0);

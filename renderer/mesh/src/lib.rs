@@ -35,16 +35,15 @@
 
 mod atlas;
 mod carve;
-mod collapse;
 mod components;
 mod connectivity;
-mod decimate;
 mod density;
 mod error;
 mod extract;
 mod fault;
 mod field;
 mod files;
+mod finish;
 mod intersections;
 mod marching_cubes;
 mod mesh;
@@ -52,27 +51,22 @@ mod nearest;
 mod normalization;
 mod person;
 mod points;
-mod quadric;
-mod relax;
 mod settings;
 #[cfg(test)]
 mod shapes;
 mod signs;
 mod skin;
-mod smooth;
-mod texture;
 mod splats;
+mod texture;
 mod topology;
 mod triangle;
 mod union_find;
-mod untangle;
 mod winding;
 
 pub use atlas::{AtlasError, AtlasSettings, MeshAtlas, mesh_atlas};
 pub use carve::{Empty, carve};
 pub use components::{Removed, keep_largest};
 pub use connectivity::Connectivity;
-pub use decimate::{DecimateError, Decimated, decimate};
 pub use density::Density;
 pub use error::MeshError;
 pub use extract::{MeshOptions, MeshReport, MeshSeconds, mesh_from_points};
@@ -82,6 +76,7 @@ pub use files::{
     JointFrame, MeshFile, MeshFileError, MeshFrame, MeshJoint, MeshSkeleton, write_3mf, write_glb, write_obj,
     write_usd_sequence, write_usdz,
 };
+pub use finish::decimate::{DecimateError, Decimated, decimate};
 pub use intersections::self_intersections;
 pub use marching_cubes::marching_cubes;
 pub use mesh::TriMesh;
@@ -91,10 +86,10 @@ pub use points::{Dropped, OrientedPoint, OrientedPoints};
 pub use settings::{Fusion, FusionSettings};
 pub use signs::close;
 pub use skin::{SkinReport, SkinSettings, skin_weights};
+pub use splats::{SplatCounts, SplatError, SplatMesh, SplatOptions, SplatReport, mesh_splats};
 pub use texture::{
     DrawnMesh, Photo, PhotoError, PhotoInputs, PhotoSettings, PhotoTexture, Poser, TexturedMesh, draw_textured,
     photograph_texture,
 };
-pub use splats::{SplatCounts, SplatError, SplatMesh, SplatOptions, SplatReport, mesh_splats};
 pub use topology::Topology;
 pub use winding::Winding;

@@ -161,10 +161,20 @@ mod tests {
         assert!(most > least + 60, "shaded from {least} to {most}");
 
         let folder = tempfile::tempdir().unwrap();
-        let metrics = json!({ "triangles": 12, "area_m2": 1.5, "closed": true, "seconds": { "fusion": 0.25 }, "none": null });
+        let metrics =
+            json!({ "triangles": 12, "area_m2": 1.5, "closed": true, "seconds": { "fusion": 0.25 }, "none": null });
         write_page(folder.path(), "Mesh".to_owned(), vec!["a sentence".to_owned()], &metrics, &mesh).unwrap();
         let html = std::fs::read_to_string(folder.path().join("index.html")).unwrap();
-        for expected in ["a sentence", "<td>area m2<td", "1.500", "yes", "<h2>seconds</h2>", "<td>fusion<td>0.250", "mesh.glb", "back"] {
+        for expected in [
+            "a sentence",
+            "<td>area m2<td",
+            "1.500",
+            "yes",
+            "<h2>seconds</h2>",
+            "<td>fusion<td>0.250",
+            "mesh.glb",
+            "back",
+        ] {
             assert!(html.contains(expected), "{expected}");
         }
     }
@@ -174,7 +184,8 @@ mod tests {
         let nan = [Vec3::splat(f32::NAN); 3];
         for positions in [&nan[..], &[]] {
             let uvs = vec![Vec2::ZERO; positions.len()];
-            let mesh = ShownMesh { positions, normals: positions, uvs: &uvs, triangles: &[[0, 1, 2]], texture: (&[], 0) };
+            let mesh =
+                ShownMesh { positions, normals: positions, uvs: &uvs, triangles: &[[0, 1, 2]], texture: (&[], 0) };
             assert_eq!(four_sides(&mesh).unwrap().len(), 2);
         }
     }

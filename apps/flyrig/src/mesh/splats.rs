@@ -15,7 +15,8 @@ use flyrig_report::{png, stop, write_whole};
 use glam::{Quat, Vec3};
 use serde_json::json;
 
-use super::arguments::{GAUSSIANS, MeshArgs, STEPS};
+use super::arguments::{GAUSSIANS, LightKind, MeshArgs, STEPS};
+use super::page::{ShownMesh, write_page};
 use super::write::write_folder;
 
 /// Files of packed splats, which other programs unpack.
@@ -116,6 +117,10 @@ fn check_options(args: &MeshArgs) -> Result<()> {
     let given = [
         ("--inputs", !take.inputs.is_empty()),
         ("--frames", take.range.frames.is_some()),
+        ("--frame", args.frame.is_some()),
+        ("--holdout", !args.holdout.is_empty()),
+        ("--light", args.light != LightKind::Removed),
+        ("--motion", args.motion.is_some()),
         ("--pose or --masks", take.perception.is_named()),
         ("--sequence", args.sequence),
         ("--steps", args.steps != STEPS),
@@ -174,7 +179,17 @@ impl Written<'_> {
         write_obj(&folder.join("mesh.obj"), &mesh)?;
         write_usdz(&folder.join("mesh.usdz"), &mesh)?;
         write_3mf(&folder.join("mesh.3mf"), &mesh)?;
-        write_whole(&folder.join("metrics.json"), &serde_json::to_vec_pretty(&self.metrics())?)
+        let metrics = self.metrics();
+        write_whole(&folder.join("metrics.json"), &serde_json::to_vec_pretty(&metrics)?)?;
+        let shown = ShownMesh {
+            positions: &positions,
+            normals: &normals,
+            uvs,
+            triangles,
+            texture: (&texture.rgb, texture.side),
+        };
+        let title = format!("Mesh of {}", self.args.take.dataset.display());
+        write_page(folder, title, Vec::new(), &metrics, &shown)
     }
 
     fn metrics(&self) -> serde_json::Value {
@@ -203,6 +218,7 @@ impl Written<'_> {
             "view_pixels": report.views[1],
             "pixel_mm": 1e3 * report.pixel_m,
             "drawn_beyond_mm": 1e3 * report.drawn_beyond_m,
+            "kept_vertices": report.kept_vertices,
         })
     }
 

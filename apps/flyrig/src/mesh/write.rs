@@ -15,6 +15,7 @@ use serde_json::json;
 
 use super::{
     arguments::{LightKind, MeshArgs},
+    page::{ShownMesh, write_page},
     photos::PhotoReport,
     source::Source,
 };
@@ -98,7 +99,34 @@ impl MeshFolder<'_> {
         self.write_rigged(&folder.join("mesh.usdz"), &file, track.as_ref())?;
         write_3mf(&folder.join("mesh.3mf"), &file)?;
         self.write_frames(folder, &file)?;
-        write_whole(&folder.join("metrics.json"), &serde_json::to_vec_pretty(&self.metrics())?)
+        let metrics = self.metrics();
+        write_whole(&folder.join("metrics.json"), &serde_json::to_vec_pretty(&metrics)?)?;
+        let shown = ShownMesh {
+            positions: &template.positions,
+            normals: &template.normals,
+            uvs: &template.uvs,
+            triangles: &template.triangles,
+            texture: (&self.person.texture.rgb, self.person.texture.side),
+        };
+        let take = self.args.take.dataset.display();
+        write_page(folder, format!("Mesh of {take}"), self.sentences(), &metrics, &shown)
+    }
+
+    /// Returns what a user should know of the mesh.
+    fn sentences(&self) -> Vec<String> {
+        let mut sentences = Vec::new();
+        if !self.source.frames.is_empty() {
+            sentences.push(format!(
+                "No photograph shows {:.0} % of the texture: its colours there are those of the Gaussians. More cameras, or frames in which the \
+                 person turns, show more.",
+                100.0 * (1.0 - self.photos.seen)
+            ));
+        }
+        let handles = self.report.topology.genus().unwrap_or_default();
+        if handles > 0 {
+            sentences.push(format!("The surface has {handles} handles, where parts of the body touch, as fingers do."));
+        }
+        sentences
     }
 
     /// Writes mesh, bones and motion as USDZ.

@@ -12,8 +12,8 @@ use glam::{DVec3, Vec2, Vec3, Vec4};
 
 use crate::{
     AtlasError, AtlasSettings, DecimateError, MeshAtlas, MeshError, MeshOptions, MeshReport, OrientedPoint,
-    OrientedPoints, SkinReport, SkinSettings, Topology, TriMesh, decimate, mesh_atlas, mesh_from_points,
-    person::hang::hang, relax::relax, skin_weights, smooth::smooth, untangle::untangle,
+    OrientedPoints, SkinReport, SkinSettings, Topology, TriMesh, finish::finish, mesh_atlas, mesh_from_points,
+    person::hang::hang, skin_weights,
 };
 
 /// Mesh of a person that poses and a deformation graph move.
@@ -92,11 +92,7 @@ impl MeshedPerson {
         avatar.pose(&Bones::at_rest(&avatar.template.skeleton), None, &mut posed);
         let (fused, mesh) = mesh_from_points(drawn_points(&posed), &options.mesh)?;
         let started = Instant::now();
-        let mut simple = decimate(&fused, options.triangles)?;
-        let corners = simple.mesh.positions.clone();
-        relax(&mut simple.mesh, &fused);
-        smooth(&mut simple.mesh, mesh.settings.spacing_m);
-        untangle(&mut simple.mesh, &corners);
+        let simple = finish(&fused, options.triangles, mesh.settings.spacing_m)?;
         let simplified_s = started.elapsed().as_secs_f64();
         let started = Instant::now();
         let (tied, skin) = Self::tie(&simple.mesh, avatar, &posed);

@@ -17,9 +17,10 @@ use flyrig_gpu::GpuContext;
 use flyrig_renderer::{AnisotropicSplats, SplatFilter};
 use glam::{Vec2, Vec3};
 
+use crate::finish::{finish, untangle::untangle};
 use crate::splats::contour::{drawn_beyond_m, move_outwards};
 use crate::splats::{paint::Painter, prepare::prepare, views::render};
-use crate::{AtlasSettings, MeshOptions, MeshReport, OrientedPoints, Topology, decimate, mesh_atlas, mesh_from_points};
+use crate::{AtlasSettings, MeshOptions, MeshReport, OrientedPoints, Topology, mesh_atlas, mesh_from_points};
 
 pub use error::SplatError;
 pub use prepare::SplatCounts;
@@ -80,6 +81,8 @@ pub struct SplatReport {
     pub pixel_m: f32,
     /// Distance from the planes of the Gaussians to the surface that they draw, along the normals, metres.
     pub drawn_beyond_m: f32,
+    /// Vertices that stay on the planes, since the surface would intersect itself there.
+    pub kept_vertices: usize,
     /// Topology of the simplified mesh.
     pub topology: Topology,
     /// Mean distance of the simplified mesh from the fused one, metres.
@@ -134,11 +137,14 @@ pub fn mesh_splats(
         views.iter().filter(|view| view.sees_through(place, margin)).nth(VOTES - 1).is_some()
     };
     let mesh_options = MeshOptions { voxel_m: Some(voxel_m), empty: Some(&empty), ..options.mesh };
-    let (mut fused, mesh) = mesh_from_points(OrientedPoints::from_rows(rows), &mesh_options)?;
-    move_outwards(&mut fused, drawn_beyond_m);
+    let (fused, mesh) = mesh_from_points(OrientedPoints::from_rows(rows), &mesh_options)?;
 
     let started = Instant::now();
-    let simple = decimate(&fused, options.triangles)?;
+    let mut simple = finish(&fused, options.triangles, prepared.spacing_m)?;
+    let planes = simple.mesh.positions.clone();
+    move_outwards(&mut simple.mesh, drawn_beyond_m);
+    // In narrow gaps both sides would pass through each other.
+    let kept_vertices = untangle(&mut simple.mesh, &planes);
     let simplified_s = started.elapsed().as_secs_f64();
     let started = Instant::now();
     let atlas = mesh_atlas(&simple.mesh, AtlasSettings { side: options.texture_side, ..AtlasSettings::default() })?;
@@ -156,6 +162,7 @@ pub fn mesh_splats(
         views: [views.len() as u32, views.first().map_or(0, |view| view.side)],
         pixel_m: views.first().map_or(0.0, |view| view.pixel * prepared.unit.scale_m() as f32),
         drawn_beyond_m,
+        kept_vertices,
         topology: Topology::measure(&simple.mesh),
         simplified_by_m: simple.mean_distance_m,
         charts: atlas.charts,

@@ -1,10 +1,10 @@
 //! Colours of a mesh's surface from the virtual cameras' images.
 
+use flyrig_body::PointGrid;
 use flyrig_renderer::SH_DEGREE_0;
 use glam::{Vec3, Vec4};
 use rayon::prelude::*;
 
-use crate::point_grid::PointGrid;
 use crate::splats::prepare::Prepared;
 use crate::splats::views::View;
 
@@ -51,7 +51,7 @@ impl<'a> Painter<'a> {
         let mut radius = self.spacing;
         for _ in 0..DOUBLINGS {
             let mut best = (radius * radius, usize::MAX);
-            self.centers.in_box(place - radius, place + radius, |i, center| {
+            self.centers.near_box(place - radius, place + radius, |i, center| {
                 let squared = center.distance_squared(place);
                 if (squared, i) < best {
                     best = (squared, i);

@@ -88,6 +88,27 @@ fn a_sphere_of_gaussians_becomes_a_closed_sphere_with_its_colors() {
 }
 
 #[test]
+fn balls_without_a_shortest_axis_become_a_closed_sphere() {
+    let mut splats = spheres(&[Vec3::ZERO], 6000);
+    for (i, (row, rotation)) in splats.scale_opacity.iter_mut().zip(&mut splats.rotation).enumerate() {
+        // Nearly alike, the shortest one of them anywhere.
+        let scale = row[0];
+        (row[0], row[1], row[2]) = (scale, 1.02 * scale, 0.98 * scale);
+        *rotation = Quat::from_euler(glam::EulerRot::XYZ, i as f32, 2.3 * i as f32, 0.7 * i as f32).to_array();
+    }
+    let (mesh, report) = mesh_splats(&splats, &gpu(), &small()).unwrap();
+    assert!(report.topology.is_closed_manifold(), "{:?}", report.topology);
+    assert_eq!((report.topology.components, report.topology.genus()), (1, Some(0)));
+    // Balls draw about two of their deviations beyond their centres.
+    let scale = splats.scale_opacity[0][0];
+    let radii: Vec<f32> = mesh.positions.iter().map(|position| position.length() - RADIUS).collect();
+    let mean = radii.iter().sum::<f32>() / radii.len() as f32;
+    assert!((0.0..3.0 * scale).contains(&mean), "{mean} m, balls of {scale} m");
+    assert!(radii.iter().all(|radius| (radius - mean).abs() < 0.01), "{radii:?}");
+    assert!(report.mesh.hole_share < 0.02, "{}", report.mesh.hole_share);
+}
+
+#[test]
 fn reruns_and_any_number_of_threads_give_the_same_mesh() {
     let splats = spheres(&[Vec3::ZERO], 3000);
     let on = |threads: usize| {

@@ -29,6 +29,8 @@ const GRAZING: f32 = 0.2;
 const COLOR_GRAZING: f32 = 0.3;
 /// Largest cosine between normal and line of sight at a contour.
 const CONTOUR: f32 = 0.05;
+/// Least cosine between the normals of a pixel's Gaussians and of the depths around it, below which the depths decide.
+const LIKE: f32 = 0.7;
 /// Exponent of the cosine in the weight of a colour: the views that face the surface decide.
 const SHARPNESS: i32 = 8;
 
@@ -152,18 +154,24 @@ impl View {
         for y in inner(phase[1] + STRIDE) {
             for x in inner(phase[0] + STRIDE) {
                 let at = (y * self.side + x) as usize;
-                let Some(place) = self.place(x, y) else { continue };
-                let facing = normals[at].dot((eye - place).normalize_or_zero());
-                let neighbors = [(x - 1, y), (x + 1, y), (x, y - 1), (x, y + 1)];
-                let is_smooth = |&(x, y): &(u32, u32)| {
-                    self.place(x, y).is_some_and(|other| normals[at].dot(other - place).abs() < far)
+                let around = [(x - 1, y), (x + 1, y), (x, y - 1), (x, y + 1)].map(|(x, y)| self.place(x, y));
+                let (Some(place), [Some(left), Some(right), Some(above), Some(below)]) = (self.place(x, y), around)
+                else {
+                    continue;
                 };
-                if facing < GRAZING || !neighbors.iter().all(is_smooth) {
+                let sight = (eye - place).normalize_or_zero();
+                // Rows go down, so this faces the camera.
+                let of_depths = (below - above).cross(right - left).normalize_or_zero();
+                // The shortest axis of a Gaussian that is nearly a ball points anywhere.
+                let normal = if normals[at].dot(of_depths) < LIKE { of_depths } else { normals[at] };
+                let facing = normal.dot(sight);
+                let is_smooth = |other: &Vec3| normal.dot(*other - place).abs() < far;
+                if facing < GRAZING || ![left, right, above, below].iter().all(is_smooth) {
                     continue;
                 }
                 points.push(OrientedPoint {
                     position: prepared.unit.restored(place.as_dvec3()),
-                    normal: normals[at],
+                    normal,
                     weight: self.alpha[at] * facing,
                     uncertainty_m: 0.5 * self.pixel * scale / facing,
                 });

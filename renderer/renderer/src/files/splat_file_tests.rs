@@ -55,7 +55,7 @@ fn types_and_orders_of_bytes_give_the_same_gaussians() {
     let shape = plain.splats.scale_opacity[3];
     let expected = [(-4.0f32).exp(), (-4.7f32).exp(), (-3.0f32).exp(), 1.0 / (1.0 + (-1.5f32).exp())];
     assert!(shape.iter().zip(expected).all(|(a, b)| (a - b).abs() < 1e-6), "{shape:?}");
-    assert_eq!(plain.splats.rotation[0], [0.0, -0.5, 0.0, 1.0]);
+    assert_eq!(plain.splats.rotation[0].map(f32::to_bits), [0.0, -0.5, 0.0, 1.0].map(f32::to_bits));
     for (double, big) in [(false, true), (true, false), (true, true)] {
         let other = SplatFile::parse(&file(&names, "", double, big)).unwrap();
         let pairs = |s: &SplatFile| [&s.splats.center, &s.splats.scale_opacity, &s.splats.harmonics].map(Clone::clone);
@@ -91,7 +91,7 @@ fn flat_gaussians_get_a_thin_axis() {
     for [a, b, c, _] in read.splats.scale_opacity {
         assert!((c / a.min(b) - FLAT).abs() < 1e-5, "{a} {b} {c}");
     }
-    assert_eq!(read.splats.rotation[2], [0.0, -0.5, 0.0, 1.0]);
+    assert_eq!(read.splats.rotation[2].map(f32::to_bits), [0.0, -0.5, 0.0, 1.0].map(f32::to_bits));
 }
 
 #[test]

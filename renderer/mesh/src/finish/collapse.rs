@@ -6,7 +6,7 @@ use std::collections::BinaryHeap;
 use glam::{DVec3, Vec3};
 
 use crate::connectivity::Connectivity;
-use crate::quadric::Quadric;
+use crate::finish::quadric::Quadric;
 
 /// Weight of the squared way of a vertex against that of the squared distance from its planes: even triangles where the surface is flat.
 const EVENNESS: f64 = 1e-3;

@@ -3,7 +3,7 @@
 use glam::Vec3;
 use rayon::prelude::*;
 
-use crate::collapse::collapse;
+use crate::finish::collapse::collapse;
 use crate::nearest::Surface;
 use crate::{MeshFault, TriMesh};
 
