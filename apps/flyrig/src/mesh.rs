@@ -5,6 +5,8 @@ mod page;
 mod photos;
 mod source;
 mod splats;
+mod texture;
+mod units;
 mod write;
 
 use std::{path::Path, time::Instant};
@@ -38,9 +40,9 @@ pub fn mesh(args: &MeshArgs, gpu: &dyn Fn() -> Result<GpuContext>) -> Result<()>
     let options = PersonOptions { mesh, triangles: args.triangles as usize, texture_side: args.texture };
     let (mut person, report) = MeshedPerson::of_avatar(&source.avatar, &options)
         .with_context(|| format!("no mesh of {}", args.take.dataset.display()))?;
-    let photos = photos::texture(&mut person, &source, args.light)?;
+    let photos = texture::photograph(&mut person, &source, args.light)?;
     let seconds = started.elapsed().as_secs_f64();
-    let held_out = photos::compare(&person, &source, args.light, gpu)?;
+    let held_out = texture::compare(&person, &source, args.light, gpu)?;
     MeshFolder {
         out: &args.out,
         source: &source,

@@ -48,7 +48,7 @@ pub use browser_kernels::BrowserKernels;
 pub use buffers::{GaussianBuffers, RenderTarget};
 pub use color::{composite_over, linear_from_srgb, rgba8_from_target, srgb_from_linear};
 pub use color_match::ColorMatcher;
-pub use files::anisotropic_ply::{parse_anisotropic_ply, write_anisotropic_ply};
+pub use files::anisotropic_ply::write_anisotropic_ply;
 pub use files::ply::{ExportError, SH_DEGREE_0};
 pub use files::ply_error::PlyError;
 pub use files::splat_file::{SplatFile, SplatFilter};

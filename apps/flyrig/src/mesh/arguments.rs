@@ -4,7 +4,7 @@ use std::path::PathBuf;
 
 use clap::{Args, ValueEnum};
 
-use super::splats::{Unit, Up};
+use super::units::{Unit, Up};
 use crate::arguments::DatasetArgs;
 
 /// Default number of Gaussians, as a rig draws.

@@ -3,7 +3,6 @@
 use std::{path::Path, time::Instant};
 
 use anyhow::{Context as _, Result, bail, ensure};
-use clap::ValueEnum;
 use flyrig_body::write_mesh_ply;
 use flyrig_gpu::GpuContext;
 use flyrig_mesh::{
@@ -12,58 +11,16 @@ use flyrig_mesh::{
 };
 use flyrig_renderer::{SplatFile, SplatFilter};
 use flyrig_report::{png, stop, write_whole};
-use glam::{Quat, Vec3};
+use glam::Vec3;
 use serde_json::json;
 
 use super::arguments::{GAUSSIANS, LightKind, MeshArgs, STEPS};
 use super::page::{ShownMesh, write_page};
+use super::units::{Unit, Up};
 use super::write::write_folder;
 
 /// Files of packed splats, which other programs unpack.
 const PACKED: [&str; 5] = ["spz", "sog", "splat", "ksplat", "lcc"];
-
-/// Length of a splat file's unit.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, ValueEnum)]
-pub enum Unit {
-    M,
-    Cm,
-    Mm,
-}
-
-impl Unit {
-    fn metres(self) -> f32 {
-        match self {
-            Self::M => 1.0,
-            Self::Cm => 0.01,
-            Self::Mm => 0.001,
-        }
-    }
-}
-
-/// Upward axis of a splat file.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, ValueEnum)]
-pub enum Up {
-    Y,
-    #[value(name = "-y")]
-    MinusY,
-    Z,
-    #[value(name = "-z")]
-    MinusZ,
-}
-
-impl Up {
-    /// Returns the rotation to y up. A file with y down turns about x, so that what faces the viewer in the usual axes of cameras, x right
-    /// and z forward, faces +z.
-    fn to_y(self) -> Quat {
-        use std::f32::consts::{FRAC_PI_2, PI};
-        match self {
-            Self::Y => Quat::IDENTITY,
-            Self::MinusY => Quat::from_rotation_x(PI),
-            Self::Z => Quat::from_rotation_x(-FRAC_PI_2),
-            Self::MinusZ => Quat::from_rotation_x(FRAC_PI_2),
-        }
-    }
-}
 
 /// Returns whether a path names splats and neither a take nor an avatar.
 pub(super) fn is_splats(path: &Path) -> bool {
@@ -285,14 +242,6 @@ impl Written<'_> {
 #[cfg(test)]
 mod tests {
     use super::*;
-
-    #[test]
-    fn the_upward_axis_becomes_y() {
-        let axes = [(Up::Y, Vec3::Y), (Up::MinusY, Vec3::NEG_Y), (Up::Z, Vec3::Z), (Up::MinusZ, Vec3::NEG_Z)];
-        for (up, axis) in axes {
-            assert!((up.to_y() * axis).distance(Vec3::Y) < 1e-6, "{up:?}");
-        }
-    }
 
     #[test]
     fn splats_are_known_by_their_extension() {

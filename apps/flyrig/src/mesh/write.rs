@@ -16,8 +16,8 @@ use serde_json::json;
 use super::{
     arguments::{LightKind, MeshArgs},
     page::{ShownMesh, write_page},
-    photos::PhotoReport,
     source::Source,
+    texture::PhotoReport,
 };
 
 /// Frames from one written surface to the next, as `flyrig eval` writes them.

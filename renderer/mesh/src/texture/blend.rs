@@ -6,9 +6,9 @@ use glam::Vec3;
 use rayon::prelude::*;
 
 use super::harmonize::Welded;
+use super::inputs::{Photo, PhotoInputs, PhotoTexture};
 use super::texels::{Texel, texels};
 use super::view::{Look, PhotoView, PosedMesh, smooth};
-use super::{Photo, PhotoInputs, PhotoTexture};
 
 /// Frames that are held at a time.
 const BATCH: usize = 4;

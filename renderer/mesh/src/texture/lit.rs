@@ -5,8 +5,8 @@ use flyrig_model::srgb;
 use glam::Vec3;
 
 use super::blend::encode;
+use super::inputs::{PhotoError, TexturedMesh, check_base, check_vertices};
 use super::texels::texels;
-use super::{PhotoError, TexturedMesh, check_base, check_vertices};
 
 /// Returns a texture of unlit colours times the light factors of the vertices.
 ///

@@ -3,7 +3,7 @@
 use flyrig_avatar::each_texel;
 use glam::Vec3;
 
-use super::TexturedMesh;
+use super::inputs::TexturedMesh;
 
 /// Point of the surface that a texel shows.
 #[derive(Debug, Clone, Copy)]

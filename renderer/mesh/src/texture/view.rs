@@ -4,7 +4,7 @@ use flyrig_types::Camera;
 use glam::{Vec2, Vec3};
 
 use super::raster::{Corner, corners, draw, project, signed_area};
-use super::{Photo, edges::edge_distances};
+use super::{edges::edge_distances, inputs::Photo};
 
 /// Cosine between normal and ray at which a view counts nothing: 75 degrees.
 const STEEPEST: f32 = 0.258_819;

@@ -10,8 +10,6 @@ use flyrig_model::srgb;
 
 use crate::anisotropic::splats::AnisotropicSplats;
 use crate::files::ply::{ExportError, SH_DEGREE_0, log_scale, opacity_logit, write_ply};
-use crate::files::ply_error::PlyError;
-use crate::files::splat_file::SplatFile;
 use crate::schema::anisotropic_ply_properties;
 
 /// Writes Gaussians as binary PLY. Normals are 0, and a comment names the filter that flyrig draws with (`SplatRenderMode: mip`).
@@ -19,23 +17,10 @@ use crate::schema::anisotropic_ply_properties;
 ///
 /// # Errors
 /// [`ExportError::Io`] names the file; the old one, if any, is then untouched.
-pub fn write_anisotropic_ply(path: &Path, splats: &AnisotropicSplats) -> Result<usize, ExportError> {
-    let rows: Vec<Vec<f32>> = (0..splats.count()).map(|i| row(splats, i)).filter(|row| all_finite(row)).collect();
-    let count = rows.len();
-    let properties = anisotropic_ply_properties(splats.order);
-    write_ply(path, properties.iter().map(String::as_str), count, rows.into_iter())?;
-    Ok(count)
-}
-
-/// Parses the Gaussians of a binary PLY file as [`SplatFile::parse`] does; the filter that they were trained with and the number of
-/// rows left out are not returned.
-///
-/// # Errors
-/// [`PlyError`].
 ///
 /// # Examples
 /// ```
-/// use flyrig_renderer::{AnisotropicSplats, HarmonicOrder, parse_anisotropic_ply, write_anisotropic_ply};
+/// use flyrig_renderer::{AnisotropicSplats, HarmonicOrder, SplatFile, write_anisotropic_ply};
 ///
 /// let mut splats = AnisotropicSplats::empty(HarmonicOrder::Zero);
 /// splats.center.push([0.0, 1.5, 0.0, 0.0]);
@@ -46,12 +31,16 @@ pub fn write_anisotropic_ply(path: &Path, splats: &AnisotropicSplats) -> Result<
 /// let folder = tempfile::tempdir()?;
 /// let path = folder.path().join("one.ply");
 /// assert_eq!(write_anisotropic_ply(&path, &splats)?, 1);
-/// let read = parse_anisotropic_ply(&std::fs::read(&path)?)?;
+/// let read = SplatFile::parse(&std::fs::read(&path)?)?.splats;
 /// assert_eq!((read.count(), read.order), (1, HarmonicOrder::Zero));
 /// # Ok::<(), Box<dyn std::error::Error>>(())
 /// ```
-pub fn parse_anisotropic_ply(bytes: &[u8]) -> Result<AnisotropicSplats, PlyError> {
-    SplatFile::parse(bytes).map(|file| file.splats)
+pub fn write_anisotropic_ply(path: &Path, splats: &AnisotropicSplats) -> Result<usize, ExportError> {
+    let rows: Vec<Vec<f32>> = (0..splats.count()).map(|i| row(splats, i)).filter(|row| all_finite(row)).collect();
+    let count = rows.len();
+    let properties = anisotropic_ply_properties(splats.order);
+    write_ply(path, properties.iter().map(String::as_str), count, rows.into_iter())?;
+    Ok(count)
 }
 
 /// Returns the values of Gaussian `i` in the order of the properties.

@@ -4,6 +4,12 @@ use std::fs;
 
 use super::*;
 use crate::anisotropic::order::HarmonicOrder;
+use crate::files::ply_error::PlyError;
+use crate::files::splat_file::SplatFile;
+
+fn parse(bytes: &[u8]) -> Result<AnisotropicSplats, PlyError> {
+    SplatFile::parse(bytes).map(|file| file.splats)
+}
 
 fn splats(order: HarmonicOrder, count: usize) -> AnisotropicSplats {
     let mut splats = AnisotropicSplats::empty(order);
@@ -32,7 +38,7 @@ fn what_is_written_is_read_again_in_every_order() {
         let splats = splats(order, 17);
         let (count, bytes) = written(&splats);
         assert_eq!(count, 17);
-        let again = parse_anisotropic_ply(&bytes).unwrap();
+        let again = parse(&bytes).unwrap();
         assert_eq!((again.order, again.count()), (order, 17));
         let attributes =
             |s: &AnisotropicSplats| [&s.center, &s.scale_opacity, &s.rotation, &s.harmonics].map(Clone::clone);
@@ -81,7 +87,7 @@ fn poison_is_left_out() {
     poisoned.harmonics[3 * 9 + 8][2] = f32::NEG_INFINITY;
     poisoned.scale_opacity[4][3] = f32::NAN;
     let (count, bytes) = written(&poisoned);
-    assert_eq!((count, parse_anisotropic_ply(&bytes).unwrap().count()), (1, 1));
+    assert_eq!((count, parse(&bytes).unwrap().count()), (1, 1));
     assert_eq!(written(&splats(HarmonicOrder::One, 0)).0, 0);
 }
 
@@ -93,7 +99,7 @@ fn damaged_files_are_refused_with_a_reason() {
         let header = String::from_utf8(bytes[..end].to_vec()).unwrap().replacen(from, to, 1);
         [header.as_bytes(), &bytes[end..]].concat()
     };
-    let refused = |bytes: &[u8]| parse_anisotropic_ply(bytes).unwrap_err();
+    let refused = |bytes: &[u8]| parse(bytes).unwrap_err();
     assert_eq!(refused(b""), PlyError::NoEnd);
     assert_eq!(refused(&bytes[..40]), PlyError::NoEnd);
     assert!(matches!(refused(&bytes[..bytes.len() - 1]), PlyError::Short { gaussians: 3, .. }));
@@ -114,7 +120,7 @@ fn damaged_files_are_refused_with_a_reason() {
     assert!(matches!(refused(nothing), PlyError::Missing(_)));
     // What other tools add does no harm.
     let commented = text("element vertex", "comment of another tool\nelement vertex");
-    assert_eq!(parse_anisotropic_ply(&commented).unwrap().count(), 3);
+    assert_eq!(parse(&commented).unwrap().count(), 3);
 }
 
 #[test]

@@ -12,7 +12,7 @@ use flyrig_capture::{
     to_rgb8,
 };
 use flyrig_page::{Page, PageMessageKind};
-use flyrig_renderer::{PlyError, parse_anisotropic_ply};
+use flyrig_renderer::{PlyError, SplatFile};
 use flyrig_transport::{
     CameraStatus, FRAME_HEADER_BYTES, FrameHeader, HEADER_BYTES, Header, RigStats, SplatState, ViewFrame,
     decode_calibration, decode_transforms,
@@ -249,13 +249,14 @@ fn network_frame(input: &[u8]) -> Result<String, String> {
 }
 
 fn ply(bytes: &[u8]) -> Result<String, String> {
-    let splats = parse_anisotropic_ply(bytes).map_err(|error| match error {
+    let file = SplatFile::parse(bytes).map_err(|error| match error {
         // These messages quote the input, so each would be a new outcome.
         PlyError::Header(_) => "a header of something else".to_owned(),
         PlyError::Short { .. } => "cut off".to_owned(),
         other => other.to_string(),
     })?;
-    Ok(format!("{} Gaussians of order {:?}", splats.count(), splats.order))
+    let SplatFile { splats, degree, is_flat, filter, .. } = file;
+    Ok(format!("{} Gaussians of degree {degree}, flat {is_flat}, {filter:?}", splats.count()))
 }
 
 fn splats(input: &[u8]) -> Result<String, String> {
