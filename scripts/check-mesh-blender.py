@@ -1,7 +1,7 @@
 #!/usr/bin/env python3
 """Opens a folder of `flyrig mesh` in Blender: vertices must lie where the files say, at rest, along the motion and with a bent elbow.
 
-    python3.11 -m venv VENV && VENV/bin/pip install bpy==5.0.1 numpy
+    python3.11 -m venv VENV && VENV/bin/pip install bpy==5.0.1 numpy scipy
     VENV/bin/python scripts/check-mesh-blender.py MESH_FOLDER [PICTURE.png]
 
 Positions are computed here from the glTF file by linear blend skinning and compared with Blender's, of mesh.glb and of mesh.usdz. Then the
@@ -30,6 +30,8 @@ class Glb:
         data = open(path, "rb").read()
         length = struct.unpack_from("<I", data, 12)[0]
         self.doc, self.bytes = json.loads(data[20:20 + length]), data[28 + length:]
+        if "skins" not in self.doc:
+            sys.exit(f"{path} has no bones: meshes of splat files are not rigged")
         skin, primitive = self.doc["skins"][0], self.doc["meshes"][0]["primitives"][0]["attributes"]
         self.points = self.read(primitive["POSITION"]).astype(float)
         self.joints, self.weights = self.read(primitive["JOINTS_0"]).astype(int), self.read(primitive["WEIGHTS_0"]).astype(float)

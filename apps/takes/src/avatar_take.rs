@@ -93,6 +93,8 @@ impl AvatarTake {
         self.frames.truncate(1);
         self.views = self.views.into_iter().filter(|view| view.frame() == at).map(|view| view.of_frame(0)).collect();
         self.numbers = vec![number];
+        let poses: Vec<_> = self.frames.iter().map(|frame| frame.pose.clone()).collect();
+        self.avatar.known_poses = KnownPoses::new(&poses);
         Ok(self)
     }
 }

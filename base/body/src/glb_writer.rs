@@ -25,6 +25,21 @@ impl GlbWriter {
         self.views.len() - 1
     }
 
+    /// Adds material 0 with a texture, a PNG file, to the document. It is unlit where the texture contains the lighting.
+    pub fn material(&mut self, document: &mut Value, png: &[u8], is_lit: bool) {
+        let view = self.bytes(png);
+        document["images"] = json!([{ "bufferView": view, "mimeType": "image/png" }]);
+        document["textures"] = json!([{ "source": 0 }]);
+        let mut material = json!({
+            "pbrMetallicRoughness": { "baseColorTexture": { "index": 0 }, "metallicFactor": 0.0, "roughnessFactor": 1.0 },
+        });
+        if !is_lit {
+            document["extensionsUsed"] = json!(["KHR_materials_unlit"]);
+            material["extensions"] = json!({ "KHR_materials_unlit": {} });
+        }
+        document["materials"] = json!([material]);
+    }
+
     fn add(&mut self, data: &[u8], component: u32, kind: &str, count: usize, bounds: Option<[Value; 2]>) -> usize {
         let view = self.bytes(data);
         let mut accessor = json!({ "bufferView": view, "componentType": component, "count": count, "type": kind });

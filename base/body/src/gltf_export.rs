@@ -74,17 +74,7 @@ pub fn write_glb(path: &Path, template: &Template, contents: GlbContents<'_>) ->
     }
     if let Some(png) = contents.texture {
         primitive["material"] = json!(0);
-        let view = glb.bytes(png);
-        document["images"] = json!([{ "bufferView": view, "mimeType": "image/png" }]);
-        document["textures"] = json!([{ "source": 0 }]);
-        let mut material = json!({
-            "pbrMetallicRoughness": { "baseColorTexture": { "index": 0 }, "metallicFactor": 0.0, "roughnessFactor": 1.0 },
-        });
-        if !contents.is_lit {
-            document["extensionsUsed"] = json!(["KHR_materials_unlit"]);
-            material["extensions"] = json!({ "KHR_materials_unlit": {} });
-        }
-        document["materials"] = json!([material]);
+        glb.material(&mut document, png, contents.is_lit);
     }
     document["meshes"] = json!([{ "primitives": [primitive] }]);
     glb.write(path, document)

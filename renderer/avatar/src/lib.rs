@@ -16,7 +16,7 @@ mod fit;
 mod local;
 mod model;
 
-pub use edit::atlas::{Atlas, DEFAULT_ATLAS_SIDE, each_texel, grow};
+pub use edit::atlas::{Atlas, DEFAULT_ATLAS_SIDE, each_texel, encode as srgb_bytes, grow};
 pub use edit::bake::BakedMesh;
 pub use edit::paint::Painted;
 pub use error::AvatarError;

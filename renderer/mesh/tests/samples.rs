@@ -52,6 +52,7 @@ fn write_all(folder: &Path, name: &str, mesh: &TriMesh, target: usize) -> String
         uvs: &atlas.uvs,
         triangles: &atlas.triangles,
         texture: Some(&texture),
+        is_lit: true,
         skeleton: None,
     };
     let path = |extension: &str| folder.join(name).with_extension(extension);

@@ -60,6 +60,9 @@ pub struct BenchSurfacesArgs {
     pub output: OutputArgs,
 }
 
+/// Reason of an early end: scores of half a take or fit are no scores.
+const STOPPED: &str = "stopped; the table holds the takes before this one";
+
 /// Scores of one surface of one take.
 #[derive(Debug, Serialize)]
 struct Row {
@@ -205,6 +208,7 @@ fn track(
         Ok(())
     })
     .with_context(|| format!("no surface of {}", settings.dataset.display()))?;
+    ensure!(!stop::requested(), STOPPED);
     ensure!(!truths.is_empty(), "{name}: the person was found in none of the frames {:?}", args.scored);
     Ok((Subject { name: name.to_owned(), take, truths, inputs }, scores))
 }
@@ -219,6 +223,7 @@ fn fit(args: &BenchSurfacesArgs, take: AvatarTake, gpu: &GpuContext) -> Result<A
         bar.inc(1);
     }
     bar.finish_and_clear();
+    ensure!(!stop::requested(), STOPPED);
     Ok(fit.into_model().into_avatar())
 }
 

@@ -2,15 +2,16 @@
 
 use std::path::PathBuf;
 
+use anyhow::{Result, ensure};
 use clap::{Args, ValueEnum};
 
 use super::units::{Unit, Up};
 use crate::arguments::DatasetArgs;
 
 /// Default number of Gaussians, as a rig draws.
-pub(super) const GAUSSIANS: u32 = 115_000;
+const GAUSSIANS: u32 = 115_000;
 /// Default steps of the fit.
-pub(super) const STEPS: u64 = 400;
+const STEPS: u64 = 400;
 
 /// Arguments of `flyrig mesh`.
 #[derive(Debug, Clone, Args)]
@@ -35,7 +36,7 @@ pub struct MeshArgs {
     /// Fusion of the Gaussians' surfaces into one.
     #[arg(long, value_enum, default_value = "hgm")]
     pub fusion: FusionKind,
-    /// Side of a voxel, millimetres; twice the distance of neighbouring Gaussians if not given.
+    /// Side of a voxel, millimetres; twice the distance of neighbouring Gaussians if not given, 1.5 times that of a splat file's.
     #[arg(long, value_parser = parse_voxel)]
     pub voxel: Option<f32>,
     /// Triangles to simplify the mesh to; more remain where fewer would change its topology.
@@ -60,6 +61,36 @@ pub struct MeshArgs {
     /// Upward axis of a splat file, which becomes y; y if not given.
     #[arg(long, value_enum, allow_hyphen_values = true)]
     pub up: Option<Up>,
+}
+
+impl MeshArgs {
+    /// Checks that no option of takes is given for another input; `kind` is what it is.
+    ///
+    /// # Errors
+    /// Names these options.
+    pub(super) fn check_no_take(&self, kind: &str) -> Result<()> {
+        let take = &self.take;
+        let given = [
+            ("--inputs", !take.inputs.is_empty()),
+            ("--frames", take.range.frames.is_some()),
+            ("--frame", self.frame.is_some()),
+            ("--holdout", !self.holdout.is_empty()),
+            ("--pose or --masks", take.perception.is_named()),
+            ("--sequence", self.sequence),
+            ("--steps", self.steps != STEPS),
+            ("--gaussians", self.gaussians != GAUSSIANS),
+            ("--lag", !take.lags.by_camera.is_empty()),
+            ("--trust-calibration", take.trust.trust_calibration),
+        ];
+        let given: Vec<&str> = given.iter().filter(|(_, given)| *given).map(|(name, _)| *name).collect();
+        ensure!(
+            given.is_empty(),
+            "{} is {kind} and not a take: leave out {}",
+            take.dataset.display(),
+            given.join(" and ")
+        );
+        Ok(())
+    }
 }
 
 /// Light in a texture.

@@ -34,7 +34,8 @@ pub(super) struct ShownMesh<'a> {
     pub texture: (&'a [u8], u32),
 }
 
-/// Writes `index.html` of a folder. Numbers and texts of `metrics` become rows of tables, one table for each object in it.
+/// Writes `index.html` of a folder. Numbers and texts of `metrics` become rows of tables, one table for each object
+/// in it.
 ///
 /// # Errors
 /// The page cannot be written.
@@ -58,11 +59,20 @@ pub(super) fn write_page(
         let entries = values.as_object().into_iter().flatten();
         entries.filter_map(|(name, value)| Some((name.replace('_', " "), text(value)?))).collect()
     };
+    let nested = |values: &Value| -> Vec<Vec<String>> {
+        let groups = values.as_object().into_iter().flatten().filter(|(_, value)| value.is_object());
+        let inner = groups.flat_map(|(group, value)| {
+            rows(value)
+                .into_iter()
+                .map(move |(name, value)| vec![format!("{}, {name}", group.replace('_', " ")), value])
+        });
+        rows(values).into_iter().map(|(name, value)| vec![name, value]).chain(inner).collect()
+    };
     let objects = metrics.as_object().into_iter().flatten().filter(|(_, value)| value.is_object());
     let tables = objects.map(|(name, value)| Table {
         title: name.replace('_', " "),
         head: vec![String::new(), String::new()],
-        rows: rows(value).into_iter().map(|(name, value)| vec![name, value]).collect(),
+        rows: nested(value),
     });
     let links = FILES.map(|(file, what)| (what.to_owned(), file.to_owned()));
     let report = Report {
@@ -161,8 +171,7 @@ mod tests {
         assert!(most > least + 60, "shaded from {least} to {most}");
 
         let folder = tempfile::tempdir().unwrap();
-        let metrics =
-            json!({ "triangles": 12, "area_m2": 1.5, "closed": true, "seconds": { "fusion": 0.25 }, "none": null });
+        let metrics = json!({ "triangles": 12, "area_m2": 1.5, "closed": true, "seconds": { "fusion": 0.25 }, "held_out": { "mesh": { "psnr_db": 30.5 } }, "none": null });
         write_page(folder.path(), "Mesh".to_owned(), vec!["a sentence".to_owned()], &metrics, &mesh).unwrap();
         let html = std::fs::read_to_string(folder.path().join("index.html")).unwrap();
         for expected in [
@@ -172,6 +181,7 @@ mod tests {
             "yes",
             "<h2>seconds</h2>",
             "<td>fusion<td>0.250",
+            "<td>mesh, psnr db<td>30.500",
             "mesh.glb",
             "back",
         ] {

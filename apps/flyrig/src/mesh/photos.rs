@@ -27,10 +27,11 @@ pub(super) struct HeldImage {
 }
 
 impl Photos {
-    /// Keeps the images of the held-out cameras of every tenth frame, or of `only` this one.
+    /// Keeps the images of the held-out cameras of the first frame in which the person was found and of every tenth one, or of `only` this
+    /// one.
     pub fn hold(&mut self, replay: &mut Replay, set: &FrameSet, only: Option<u64>) -> Result<()> {
         let number = frame_number(set);
-        let is_held = only.map_or(number.is_multiple_of(HELD_EVERY), |only| only == number);
+        let is_held = only.map_or(self.held.is_empty() || number.is_multiple_of(HELD_EVERY), |only| only == number);
         if replay.holdout.is_empty() || !is_held {
             return Ok(());
         }

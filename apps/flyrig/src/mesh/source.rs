@@ -41,15 +41,7 @@ impl Source {
     pub fn open(args: &MeshArgs, gpu: &dyn Fn() -> Result<GpuContext>) -> Result<Self> {
         let path = &args.take.dataset;
         if path.extension().is_some_and(|extension| extension == "flyavatar" || extension == "person") {
-            ensure!(
-                args.take.inputs.is_empty()
-                    && args.holdout.is_empty()
-                    && args.take.range.frames.is_none()
-                    && args.frame.is_none()
-                    && !args.sequence,
-                "{} is an avatar and not a take: leave out --inputs, --holdout, --frames, --frame and --sequence",
-                path.display()
-            );
+            args.check_no_take("an avatar")?;
             let avatar = load(path)?;
             let motion =
                 args.motion.as_deref().map(|motion| DrivenMotion::load(&avatar.surface(), motion)).transpose()?;
@@ -99,6 +91,7 @@ impl Source {
             photos.hold(replay, set, args.frame)
         })
         .with_context(|| format!("no mesh of {}", take_args.dataset.display()))?;
+        ensure!(!stop::requested(), "stopped; nothing was written");
         let take = match args.frame {
             Some(frame) => take.only(frame)?,
             None => take,
@@ -109,7 +102,6 @@ impl Source {
         println!("tracked {} frames in {tracked_s:.0} s", frames.len());
         let up = replay.session.rig().world_up;
         drop(replay);
-        ensure!(!stop::requested(), "stopped; nothing was written");
         let started = Instant::now();
         let avatar = if args.steps == 0 {
             avatar

@@ -14,7 +14,7 @@ use flyrig_report::{png, stop, write_whole};
 use glam::Vec3;
 use serde_json::json;
 
-use super::arguments::{GAUSSIANS, LightKind, MeshArgs, STEPS};
+use super::arguments::{LightKind, MeshArgs};
 use super::page::{ShownMesh, write_page};
 use super::units::{Unit, Up};
 use super::write::write_folder;
@@ -68,29 +68,13 @@ pub(super) fn mesh_file(args: &MeshArgs, mesh: MeshOptions<'_>, gpu: &dyn Fn() -
     Ok(())
 }
 
-/// Checks that no option of takes is given.
+/// Checks that no option of takes or avatars is given.
 fn check_options(args: &MeshArgs) -> Result<()> {
-    let take = &args.take;
-    let given = [
-        ("--inputs", !take.inputs.is_empty()),
-        ("--frames", take.range.frames.is_some()),
-        ("--frame", args.frame.is_some()),
-        ("--holdout", !args.holdout.is_empty()),
-        ("--light", args.light != LightKind::Removed),
-        ("--motion", args.motion.is_some()),
-        ("--pose or --masks", take.perception.is_named()),
-        ("--sequence", args.sequence),
-        ("--steps", args.steps != STEPS),
-        ("--gaussians", args.gaussians != GAUSSIANS),
-        ("--lag", !take.lags.by_camera.is_empty()),
-        ("--trust-calibration", take.trust.trust_calibration),
-    ];
-    let given: Vec<&str> = given.iter().filter(|(_, given)| *given).map(|(name, _)| *name).collect();
+    args.check_no_take("a splat file")?;
     ensure!(
-        given.is_empty(),
-        "{} is a splat file and not a take: leave out {}",
-        take.dataset.display(),
-        given.join(" and ")
+        args.motion.is_none() && args.light == LightKind::Removed,
+        "{} is a splat file, without bones and with the light in its colours: leave out --motion and --light",
+        args.take.dataset.display()
     );
     Ok(())
 }
@@ -130,6 +114,8 @@ impl Written<'_> {
             uvs,
             triangles,
             texture: Some(&image),
+            // The colours of photographs contain the light.
+            is_lit: false,
             skeleton: None,
         };
         write_glb(&folder.join("mesh.glb"), &mesh)?;

@@ -3,6 +3,7 @@
 use std::path::{Path, PathBuf};
 
 use anyhow::{Context as _, Result, ensure};
+use flyrig_avatar::Light;
 use flyrig_body::{GlbContents, write_glb, write_mesh_ply};
 use flyrig_mesh::{
     JointFrame, MeshFile, MeshFrame, MeshJoint, MeshSkeleton, MeshedPerson, PersonReport, write_3mf, write_obj,
@@ -81,11 +82,7 @@ impl MeshFolder<'_> {
     fn write_to(&self, folder: &Path) -> Result<()> {
         let (track, template) = (self.track()?, &self.person.template);
         let texture = png::encode_rgb(&self.person.texture.rgb, self.person.texture.side, self.person.texture.side)?;
-        let contents = GlbContents {
-            track: track.as_ref(),
-            texture: Some(&texture),
-            is_lit: self.args.light == LightKind::Removed,
-        };
+        let contents = GlbContents { track: track.as_ref(), texture: Some(&texture), is_lit: self.is_lit() };
         write_glb(&folder.join("mesh.glb"), template, contents)?;
         let file = MeshFile {
             positions: &template.positions,
@@ -93,6 +90,7 @@ impl MeshFolder<'_> {
             uvs: &template.uvs,
             triangles: &template.triangles,
             texture: Some(&texture),
+            is_lit: self.is_lit(),
             skeleton: None,
         };
         write_obj(&folder.join("mesh.obj"), &file)?;
@@ -112,6 +110,11 @@ impl MeshFolder<'_> {
         write_page(folder, format!("Mesh of {take}"), self.sentences(), &metrics, &shown)
     }
 
+    /// Returns whether other programs light the texture: the light of the take was estimated, by the fit, and removed.
+    fn is_lit(&self) -> bool {
+        self.args.light == LightKind::Removed && self.source.avatar.light != Light::default()
+    }
+
     /// Returns what a user should know of the mesh.
     fn sentences(&self) -> Vec<String> {
         let mut sentences = Vec::new();
@@ -121,6 +124,9 @@ impl MeshFolder<'_> {
                  person turns, show more.",
                 100.0 * (1.0 - self.photos.seen)
             ));
+        }
+        if self.args.light == LightKind::Removed && !self.is_lit() {
+            sentences.push("The light of the take is not known, since nothing was fitted to it: it is in the texture, and the materials are unlit.".to_owned());
         }
         let handles = self.report.topology.genus().unwrap_or_default();
         if handles > 0 {

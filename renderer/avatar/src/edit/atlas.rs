@@ -233,7 +233,9 @@ pub fn grow(image: &mut [Option<[u8; 3]>], side: usize) {
     }
 }
 
-pub(crate) fn encode(linear: Vec3) -> [u8; 3] {
+/// Returns the sRGB bytes of a linear colour.
+#[must_use]
+pub fn encode(linear: Vec3) -> [u8; 3] {
     linear.to_array().map(|value| (255.0 * srgb_from_linear(value) + 0.5) as u8)
 }
 

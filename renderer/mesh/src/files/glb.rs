@@ -8,8 +8,7 @@ use serde_json::json;
 
 use super::mesh_file::{MeshFile, MeshFileError, refused};
 
-/// Writes a mesh without its skeleton as binary glTF 2.0, metres, y up. The material of a texture is unlit: the colours of photographs
-/// contain the light. [`flyrig_body::write_glb`] writes meshes with bones.
+/// Writes a mesh without its skeleton as binary glTF 2.0, metres, y up. [`flyrig_body::write_glb`] writes meshes with bones.
 ///
 /// # Errors
 /// [`MeshFileError`] for faulty content, a file beyond 4 GiB, and when the system fails.
@@ -28,14 +27,7 @@ pub fn write_glb(path: &Path, mesh: &MeshFile<'_>) -> Result<(), MeshFileError> 
     let mut document = json!({ "scene": 0, "scenes": [{ "nodes": [0] }], "nodes": [{ "name": "mesh", "mesh": 0 }] });
     if let Some(png) = mesh.texture {
         primitive["material"] = json!(0);
-        let view = glb.bytes(png);
-        document["extensionsUsed"] = json!(["KHR_materials_unlit"]);
-        document["images"] = json!([{ "bufferView": view, "mimeType": "image/png" }]);
-        document["textures"] = json!([{ "source": 0 }]);
-        document["materials"] = json!([{
-            "pbrMetallicRoughness": { "baseColorTexture": { "index": 0 }, "metallicFactor": 0.0, "roughnessFactor": 1.0 },
-            "extensions": { "KHR_materials_unlit": {} },
-        }]);
+        glb.material(&mut document, png, mesh.is_lit);
     }
     document["meshes"] = json!([{ "primitives": [primitive] }]);
     glb.write(path, document).map_err(|error| match error {
@@ -64,6 +56,7 @@ mod tests {
             uvs: &[Vec2::ZERO, Vec2::X, Vec2::Y, Vec2::ONE],
             triangles: &[[0, 2, 1], [0, 1, 3], [0, 3, 2], [1, 2, 3]],
             texture: Some(b"\x89PNG\r\n\x1a\nrest"),
+            is_lit: false,
             skeleton: None,
         };
         write_glb(&path, &mesh).unwrap();

@@ -44,6 +44,8 @@ pub struct MeshFile<'a> {
     pub triangles: &'a [[u32; 3]],
     /// Texture as a PNG file, sRGB.
     pub texture: Option<&'a [u8]>,
+    /// Whether other programs light the texture; otherwise it contains the lighting.
+    pub is_lit: bool,
     /// Skeleton, for the formats that have one (USDZ).
     pub skeleton: Option<MeshSkeleton<'a>>,
 }

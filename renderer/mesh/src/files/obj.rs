@@ -20,7 +20,10 @@ pub fn write_obj(path: &Path, mesh: &MeshFile<'_>) -> Result<(), MeshFileError> 
             let (texture_path, texture) = beside(path, "png")?;
             let (material_path, material) = beside(path, "mtl")?;
             write_whole(&texture_path, |out| out.write_all(png)).map_err(system(&texture_path))?;
-            let text = format!("newmtl surface\nKa 0 0 0\nKd 1 1 1\nKs 0 0 0\nillum 1\nmap_Kd {texture}\n");
+            // Illumination 0 is the plain colour.
+            let illumination = u8::from(mesh.is_lit);
+            let text =
+                format!("newmtl surface\nKa 0 0 0\nKd 1 1 1\nKs 0 0 0\nillum {illumination}\nmap_Kd {texture}\n");
             write_whole(&material_path, |out| out.write_all(text.as_bytes())).map_err(system(&material_path))?;
             Some(material)
         }

@@ -42,7 +42,7 @@ impl Sample {
 
     fn mesh(&self) -> MeshFile<'_> {
         let Self { positions, normals, uvs, triangles, .. } = self;
-        MeshFile { positions, normals, uvs, triangles, texture: Some(PNG), skeleton: None }
+        MeshFile { positions, normals, uvs, triangles, texture: Some(PNG), is_lit: true, skeleton: None }
     }
 
     fn skeleton<'a>(&'a self, frames: &'a [JointFrame<'a>]) -> MeshSkeleton<'a> {
@@ -70,6 +70,25 @@ fn obj_counts_from_one_and_has_v_up() {
     write_obj(&folder.path().join("plain.obj"), &MeshFile { uvs: &[], texture: None, ..sample.mesh() }).unwrap();
     assert!(fs::read_to_string(folder.path().join("plain.obj")).unwrap().ends_with("f 3//3 1//1 4//4\n"));
     assert_eq!(fs::read_dir(folder.path()).unwrap().count(), 4);
+}
+
+#[test]
+fn textures_that_contain_the_light_are_not_lit_again() {
+    let folder = tempfile::tempdir().unwrap();
+    let sample = Sample::new();
+    for (is_lit, illumination, color, other) in [
+        (true, "illum 1", "inputs:diffuseColor.connect", "emissiveColor"),
+        (false, "illum 0", "inputs:emissiveColor.connect", "diffuseColor.connect"),
+    ] {
+        let mesh = MeshFile { is_lit, ..sample.mesh() };
+        write_obj(&folder.path().join("a.obj"), &mesh).unwrap();
+        assert!(fs::read_to_string(folder.path().join("a.mtl")).unwrap().contains(illumination));
+        write_usdz(&folder.path().join("a.usdz"), &mesh).unwrap();
+        // Files in USDZ are not compressed.
+        let bytes = fs::read(folder.path().join("a.usdz")).unwrap();
+        let has = |text: &str| bytes.windows(text.len()).any(|window| window == text.as_bytes());
+        assert!(has(color) && !has(other), "{is_lit}");
+    }
 }
 
 #[test]

@@ -93,7 +93,7 @@ impl<F: FnMut(usize) -> io::Result<MeshFrame>> Frames<'_, F> {
         }
         writeln!(out, "        }}\n    }}")?;
         if let Some(texture) = texture {
-            write_material(out, texture)?;
+            write_material(out, texture, self.mesh.is_lit)?;
         }
         writeln!(out, "}}")
     }

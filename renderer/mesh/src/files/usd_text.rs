@@ -114,8 +114,10 @@ pub(super) fn write_mesh_opening(out: &mut impl Write, mesh: &MeshFile<'_>) -> i
     writeln!(out)
 }
 
-/// Writes the material `Root/Material`, whose diffuse colour is a texture file.
-pub(super) fn write_material(out: &mut impl Write, texture: &str) -> io::Result<()> {
+/// Writes the material `Root/Material`: a texture file is its diffuse colour or, unlit, what it emits.
+pub(super) fn write_material(out: &mut impl Write, texture: &str, is_lit: bool) -> io::Result<()> {
+    let color = if is_lit { "diffuseColor" } else { "emissiveColor" };
+    let dark = if is_lit { "" } else { "\n            color3f inputs:diffuseColor = (0, 0, 0)" };
     writeln!(
         out,
         r#"
@@ -126,7 +128,7 @@ pub(super) fn write_material(out: &mut impl Write, texture: &str) -> io::Result<
         def Shader "Surface"
         {{
             uniform token info:id = "UsdPreviewSurface"
-            color3f inputs:diffuseColor.connect = </Root/Material/Texture.outputs:rgb>
+            color3f inputs:{color}.connect = </Root/Material/Texture.outputs:rgb>{dark}
             float inputs:metallic = 0
             float inputs:roughness = 1
             token outputs:surface

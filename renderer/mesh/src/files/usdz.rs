@@ -60,7 +60,7 @@ fn write_stage(out: &mut impl Write, mesh: &MeshFile<'_>) -> io::Result<()> {
     }
     writeln!(out, "    }}")?;
     if mesh.texture.is_some() {
-        write_material(out, TEXTURE)?;
+        write_material(out, TEXTURE, mesh.is_lit)?;
     }
     if let Some(skeleton) = &mesh.skeleton {
         write_skeleton(out, skeleton, times.as_ref())?;

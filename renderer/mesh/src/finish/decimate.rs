@@ -24,8 +24,7 @@ pub enum DecimateError {
 /// Simplified mesh and its distance from the original.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Decimated {
-    /// Simplified mesh; it has more triangles than the target where the topology requires them. Its vertices are some of the
-    /// original ones.
+    /// Simplified mesh; it has more triangles than the target where the topology requires them.
     pub mesh: TriMesh,
     /// Index of the original vertex of each vertex.
     pub source: Vec<u32>,
@@ -40,10 +39,10 @@ pub struct Decimated {
 /// `target` triangles, and with more triangles than `target` where fewer would break it. Equal input gives equal output.
 ///
 /// # Errors
-/// [`DecimateError`] for a faulty mesh and for one with 2^28 vertices or more.
+/// [`DecimateError`] for a faulty mesh and for one with more than 2^28 vertices.
 pub fn decimate(mesh: &TriMesh, target: usize) -> Result<Decimated, DecimateError> {
     MeshFault::check(mesh)?;
-    if mesh.positions.len() >= MAX_VERTICES {
+    if mesh.positions.len() > MAX_VERTICES {
         return Err(DecimateError::TooLarge(mesh.positions.len()));
     }
     let is_small = mesh.triangles.len() <= target;

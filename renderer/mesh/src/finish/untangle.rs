@@ -5,14 +5,12 @@ use glam::Vec3;
 use crate::TriMesh;
 use crate::intersections::intersecting;
 
-/// Rounds, each with more vertices around the intersections that are left.
-const ROUNDS: usize = 6;
-
 /// Puts the vertices of triangles that intersect others, and those around them, back to where they were `before`, until none intersects or
 /// all of them are back. Returns the number of vertices put back.
 pub(crate) fn untangle(mesh: &mut TriMesh, before: &[Vec3]) -> usize {
     let mut is_back = vec![false; mesh.positions.len()];
-    for _ in 0..ROUNDS {
+    // Each round but the last puts further vertices back.
+    loop {
         let pairs = intersecting(mesh);
         let mut is_near = vec![false; mesh.positions.len()];
         for triangle in pairs.as_flattened() {
@@ -60,7 +58,15 @@ mod tests {
         let start = mesh.positions.clone();
         assert!(self_intersections(&mesh) > 0);
         mesh.positions.iter_mut().for_each(|p| *p *= 1.01);
-        assert!(untangle(&mut mesh, &start) > 0);
+        let moved = mesh.positions.clone();
+        let back = untangle(&mut mesh, &start);
+        assert!(back > 0 && back < start.len(), "{back}");
+        let all = mesh.positions.iter().zip(start.iter().zip(&moved));
+        assert!(all.clone().all(|(now, (start, moved))| now == start || now == moved));
+        assert_eq!(all.filter(|(now, (start, moved))| now == start && now != moved).count(), back);
+        for pair in intersecting(&mesh).as_flattened() {
+            assert!(mesh.triangles[*pair as usize].iter().all(|i| mesh.positions[*i as usize] == start[*i as usize]));
+        }
         assert_eq!(untangle(&mut TriMesh::default(), &[]), 0);
     }
 }

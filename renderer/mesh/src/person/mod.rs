@@ -50,7 +50,7 @@ pub enum PersonError {
 pub struct PersonOptions<'a> {
     /// Fusion and surface.
     pub mesh: MeshOptions<'a>,
-    /// Triangles to simplify to; a mesh with fewer stays as it is.
+    /// Triangles to simplify to; a mesh with fewer keeps its own.
     pub triangles: usize,
     /// Texels along a side of the texture.
     pub texture_side: u32,
@@ -67,7 +67,7 @@ impl Default for PersonOptions<'_> {
 pub struct PersonReport {
     /// Topology of the simplified and smoothed mesh.
     pub topology: Topology,
-    /// Mean distance of the simplified mesh from the fused one, metres.
+    /// Mean distance of the simplified mesh from the fused one before it is smoothed, metres.
     pub simplified_by_m: f32,
     /// Charts of the texture.
     pub charts: u32,

@@ -51,7 +51,11 @@ impl SplatError {
 }
 
 fn shown(extent_m: f64) -> String {
-    if (10.0..1e6).contains(&extent_m) { format!("{extent_m:.0}") } else { format!("{extent_m:.3e}") }
+    match extent_m {
+        10.0..1e6 => format!("{extent_m:.0}"),
+        0.001..10.0 => format!("{extent_m:.3}"),
+        _ => format!("{extent_m:.3e}"),
+    }
 }
 
 /// Returns the way to metres for an extent in the file's own unit.
@@ -73,7 +77,7 @@ mod tests {
         };
         assert_eq!(text(1748.0, 1.0), Err("1748 m tall; give --unit mm".to_owned()));
         assert_eq!(text(174.8, 1.0), Err("175 m tall; give --unit cm".to_owned()));
-        assert_eq!(text(1.748, 0.001), Err("1.748e-3 m tall; give --unit m".to_owned()));
+        assert_eq!(text(1.748, 0.001), Err("0.002 m tall; give --unit m".to_owned()));
         assert_eq!(text(1748.0, 0.001), Ok(()));
         assert!(text(7.0, 1.0).unwrap_err().ends_with("splat-transform IN.ply -s 2.500e-1 OUT.ply"));
         for absurd in [1e30, 1e-30] {

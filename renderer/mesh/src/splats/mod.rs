@@ -55,7 +55,7 @@ pub struct SplatOptions<'a> {
     /// Fusion and surface; without a voxel side, one and a half distances of neighbouring Gaussians. Its empty space is replaced by that
     /// of the virtual cameras.
     pub mesh: MeshOptions<'a>,
-    /// Triangles to simplify to; a mesh with fewer stays as it is.
+    /// Triangles to simplify to; a mesh with fewer keeps its own.
     pub triangles: usize,
     /// Texels along a side of the texture.
     pub texture_side: u32,
@@ -85,7 +85,7 @@ pub struct SplatReport {
     pub kept_vertices: usize,
     /// Topology of the simplified mesh.
     pub topology: Topology,
-    /// Mean distance of the simplified mesh from the fused one, metres.
+    /// Mean distance of the simplified mesh from the fused one before it is smoothed, metres.
     pub simplified_by_m: f32,
     /// Charts of the texture.
     pub charts: u32,

@@ -204,8 +204,8 @@ impl View {
     }
 
     /// Returns the distance along the unit normal from a point at the contour of the surface to where alpha falls below one half, unit
-    /// size. `None` where the camera sees the point face-on or behind another surface by more than `tolerance`, and where alpha does not
-    /// fall within `farthest`.
+    /// size; negative where it has fallen before the point. `None` where the camera sees the point face-on or behind another surface by
+    /// more than four times `tolerance`, and where alpha does not fall within `farthest`.
     pub fn to_contour(&self, place: Vec3, normal: Vec3, farthest: f32, tolerance: f32) -> Option<f32> {
         let sight = (place - self.eye()).normalize_or_zero();
         if normal.dot(sight).abs() > CONTOUR {
@@ -215,16 +215,19 @@ impl View {
         if around.iter().any(|(i, _)| self.depth[*i] > 0.0 && depth > self.depth[*i] + 4.0 * tolerance) {
             return None;
         }
-        let step = 0.5 * self.pixel;
-        let mut before: f32 = 1.0;
-        for k in 0..=(farthest / step) as usize {
-            let (_, around) = self.project(place + normal * (k as f32 * step))?;
-            let alpha: f32 = around.iter().map(|(i, weight)| self.alpha[*i] * weight).sum();
-            if alpha < SOLID {
-                let part = (before - SOLID) / (before - alpha).max(1e-6);
-                return Some((k as f32 - 1.0 + part).max(0.0) * step);
+        let alpha = |distance: f32| -> Option<f32> {
+            let (_, around) = self.project(place + normal * distance)?;
+            Some(around.iter().map(|(i, weight)| self.alpha[*i] * weight).sum())
+        };
+        let mut before = alpha(0.0)?;
+        let is_inside = before >= SOLID;
+        let step = if is_inside { 0.5 * self.pixel } else { -0.5 * self.pixel };
+        for k in 1..=(farthest / step.abs()) as usize {
+            let now = alpha(k as f32 * step)?;
+            if (now >= SOLID) != is_inside {
+                return Some((k as f32 - 1.0 + (before - SOLID) / (before - now)) * step);
             }
-            before = alpha;
+            before = now;
         }
         None
     }

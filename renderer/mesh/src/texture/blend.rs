@@ -1,6 +1,6 @@
 //! Means of the photographs' colours in each texel.
 
-use flyrig_avatar::{Atlas, grow};
+use flyrig_avatar::{Atlas, grow, srgb_bytes};
 use flyrig_model::srgb;
 use glam::Vec3;
 use rayon::prelude::*;
@@ -177,7 +177,7 @@ fn finish(
         texels.par_iter().zip(sums.par_iter().zip(&means)).with_min_len(1024).map(color).collect();
     let mut image = vec![None; side * side];
     for (texel, (color, _)) in texels.iter().zip(&colors) {
-        image[texel.index as usize] = Some(encode(*color));
+        image[texel.index as usize] = Some(srgb_bytes(*color));
     }
     let seen: f64 = colors.iter().map(|(_, seen)| f64::from(*seen)).sum();
     grow(&mut image, side);
@@ -221,9 +221,4 @@ impl Sums {
         let sharp = if self.sharp_weight < 1e-30 { plain } else { self.sharp / self.sharp_weight };
         Some((sharp, plain))
     }
-}
-
-/// Returns the sRGB bytes of a linear colour.
-pub(super) fn encode(linear: Vec3) -> [u8; 3] {
-    linear.to_array().map(|value| (255.0 * srgb::encode(value.clamp(0.0, 1.0), f32::powf) + 0.5) as u8)
 }

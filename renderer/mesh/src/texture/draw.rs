@@ -1,13 +1,16 @@
 //! Textured mesh in the image of a camera.
 
+use flyrig_avatar::srgb_bytes;
 use flyrig_model::srgb;
 use flyrig_types::{Camera, RenderedView};
 use glam::{Vec2, Vec3};
 
-use super::raster::{draw, project};
+use super::raster::{Corner, draw, project};
 
 /// Samples along a side of a pixel.
 const SAMPLES: usize = 3;
+/// Rows of pixels that are drawn at a time.
+const BAND: usize = 64;
 
 /// Mesh, texture and light that are drawn.
 #[derive(Clone, Copy)]
@@ -40,12 +43,7 @@ pub fn draw_textured(mesh: &DrawnMesh<'_>, camera: &Camera) -> RenderedView {
     let intrinsics = &mut fine.intrinsics;
     intrinsics.focal_px *= SAMPLES as f64;
     intrinsics.center_px = (intrinsics.center_px + 0.5) * SAMPLES as f64 - 0.5;
-    let size = [width * SAMPLES, height * SAMPLES];
     let projected = project(&fine, mesh.positions);
-    let mut hits: Vec<Option<(u32, [f32; 3])>> = vec![None; size[0] * size[1]];
-    drop(draw(&projected, mesh.triangles, size, |pixel, triangle, weights| {
-        hits[pixel] = Some((triangle as u32, weights));
-    }));
     let linear: [f32; 256] = srgb::byte_table(f32::powf);
     let color = |triangle: u32, weights: [f32; 3]| -> Option<Vec3> {
         let corners = mesh.triangles[triangle as usize].map(|i| i as usize);
@@ -56,21 +54,25 @@ pub fn draw_textured(mesh: &DrawnMesh<'_>, camera: &Camera) -> RenderedView {
         }
         Some(sample(mesh.rgb, side, uv, &linear) * shade)
     };
-    for (pixel, rgba) in rgba.chunks_exact_mut(4).enumerate() {
-        let (x, y) = (pixel % width * SAMPLES, pixel / width * SAMPLES);
-        let (mut sum, mut count) = (Vec3::ZERO, 0u32);
-        for (u, v) in (0..SAMPLES).flat_map(|v| (0..SAMPLES).map(move |u| (u, v))) {
-            let hit = hits[(y + v) * size[0] + x + u];
-            if let Some(color) = hit.and_then(|(triangle, weights)| color(triangle, weights)) {
-                sum += color;
-                count += 1;
+    // Samples take twenty bytes each: a band of rows at a time.
+    for (band, rows) in rgba.chunks_mut(4 * width.max(1) * BAND).enumerate() {
+        let first = (band * BAND * SAMPLES) as f32;
+        let lifted: Vec<Option<Corner>> =
+            projected.iter().map(|corner| corner.map(|c| Corner { pixel: c.pixel - Vec2::Y * first, ..c })).collect();
+        let size = [width * SAMPLES, rows.len() / (4 * width) * SAMPLES];
+        let mut hits: Vec<Option<(u32, [f32; 3])>> = vec![None; size[0] * size[1]];
+        drop(draw(&lifted, mesh.triangles, size, |sample, triangle, weights| {
+            hits[sample] = Some((triangle as u32, weights));
+        }));
+        for (pixel, rgba) in rows.chunks_exact_mut(4).enumerate() {
+            let (x, y) = (pixel % width * SAMPLES, pixel / width * SAMPLES);
+            let samples = (0..SAMPLES).flat_map(|v| (0..SAMPLES).map(move |u| (y + v) * size[0] + x + u));
+            let colors = samples.filter_map(|at| hits[at].and_then(|(triangle, weights)| color(triangle, weights)));
+            let (sum, count) = colors.fold((Vec3::ZERO, 0u32), |(sum, count), color| (sum + color, count + 1));
+            if count > 0 {
+                rgba[..3].copy_from_slice(&srgb_bytes(sum / count as f32));
+                rgba[3] = (255 * count as usize / (SAMPLES * SAMPLES)) as u8;
             }
-        }
-        if count > 0 {
-            let mean = (sum / count as f32).to_array();
-            let bytes = mean.map(|value| (255.0 * srgb::encode(value.clamp(0.0, 1.0), f32::powf) + 0.5) as u8);
-            rgba[..3].copy_from_slice(&bytes);
-            rgba[3] = (255 * count as usize / (SAMPLES * SAMPLES)) as u8;
         }
     }
     view(rgba)

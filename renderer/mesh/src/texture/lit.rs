@@ -1,10 +1,9 @@
 //! Light in the texture of the Gaussians.
 
-use flyrig_avatar::{Atlas, grow};
+use flyrig_avatar::{Atlas, grow, srgb_bytes};
 use flyrig_model::srgb;
 use glam::Vec3;
 
-use super::blend::encode;
 use super::inputs::{PhotoError, TexturedMesh, check_base, check_vertices};
 use super::texels::texels;
 
@@ -23,7 +22,7 @@ pub(crate) fn light_texture(mesh: &TexturedMesh<'_>, unlit: &Atlas, shades: &[Ve
         let known = &unlit.rgb[3 * texel.index as usize..][..3];
         let color = Vec3::from_array(std::array::from_fn(|k| linear[usize::from(known[k])]));
         let shade = texel.blend(mesh.triangles, |vertex| shades[vertex as usize]);
-        image[texel.index as usize] = Some(encode(color * shade));
+        image[texel.index as usize] = Some(srgb_bytes(color * shade));
     }
     grow(&mut image, side);
     let rest = unlit.rgb.as_chunks().0;

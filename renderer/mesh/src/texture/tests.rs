@@ -3,11 +3,11 @@ use flyrig_model::srgb;
 use flyrig_types::{Camera, Intrinsics, Isometry, Lens};
 use glam::{DVec2, DVec3, Vec2, Vec3};
 
-use super::blend::encode;
 use super::texels::{Texel, texels};
 use super::view::{PhotoView, PosedMesh};
 use super::*;
 use crate::{AtlasSettings, MeshAtlas, TriMesh, mesh_atlas, shapes};
+use flyrig_avatar::srgb_bytes as encode;
 
 const SIDE: u32 = 128;
 const GREY: [u8; 3] = [120, 120, 120];

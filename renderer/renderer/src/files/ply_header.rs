@@ -117,8 +117,12 @@ impl<'a> Header<'a> {
         for line in bytes[..bytes.len().min(LONGEST)].split_inclusive(|byte| *byte == b'\n') {
             let is_first = length == 0;
             length += line.len();
-            let text =
-                std::str::from_utf8(line).ok().and_then(|text| text.strip_suffix('\n')).ok_or(PlyError::NoEnd)?.trim();
+            // Comments may be in any encoding.
+            let is_comment = line.starts_with(b"comment") || line.starts_with(b"obj_info");
+            let text = match std::str::from_utf8(line) {
+                Err(_) if is_comment && !is_first => continue,
+                text => text.ok().and_then(|text| text.strip_suffix('\n')).ok_or(PlyError::NoEnd)?.trim(),
+            };
             let refused = || PlyError::Header(text.chars().take(80).collect());
             let words: Vec<&str> = text.split_ascii_whitespace().collect();
             match words.as_slice() {
@@ -142,7 +146,11 @@ impl<'a> Header<'a> {
                     element.columns.push((name, Column { offset: element.row_bytes, kind }));
                     element.row_bytes += kind.bytes();
                 }
-                ["end_header"] => return Self::new(endian, elements, comments, length).ok_or_else(refused),
+                ["end_header"] => {
+                    let lacking = if endian.is_none() { "nothing of a format" } else { "nothing of an element vertex" };
+                    let lacking = || PlyError::Header(lacking.to_owned());
+                    return Self::new(endian, elements, comments, length).ok_or_else(lacking);
+                }
                 _ => return Err(refused()),
             }
         }
