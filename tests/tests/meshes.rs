@@ -83,8 +83,8 @@ fn a_take_becomes_a_closed_mesh_that_moves_as_the_person_does() {
     };
     refused(&["a.flyavatar", "--out", "m"], "m exists already");
     refused(&["a.flyavatar", "--out", "none/m"], "the folder none does not exist");
-    refused(&["a.flyavatar", "--out", "x", "--inputs", "00"], "is an avatar and not a take");
-    refused(&["a.flyavatar", "--out", "x", "--holdout", "01"], "leave out --inputs, --holdout");
+    let of_takes = ["a.flyavatar", "--out", "x", "--inputs", "00", "--holdout", "01", "--steps", "7"];
+    refused(&of_takes, "a.flyavatar is an avatar and not a take: leave out --inputs and --holdout and --steps");
     refused(&[&take, "--out", "x", "--inputs", "00,02", "--holdout", "02"], "both an input and held out");
     refused(&["a.flyavatar", "--out", "."], "names no folder");
     fs::create_dir(folder.path().join("x.partial")).unwrap();
