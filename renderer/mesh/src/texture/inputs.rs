@@ -64,7 +64,7 @@ pub enum PhotoError {
     },
 }
 
-/// Inputs of [`photograph_texture`].
+/// Inputs of [`crate::photograph_texture`].
 #[derive(Clone, Copy)]
 pub struct PhotoInputs<'a> {
     /// Mesh.
