@@ -112,8 +112,9 @@ mod tests {
         let points = image.points(&camera);
         assert!(points.len() > 1000, "{}", points.len());
         for (point, triangle) in &points {
+            // Vertices are rounded to single precision.
             assert!(*triangle < 2, "the front hides the rest");
-            assert!((point.y - 0.4 * point.z).abs() < 1e-9, "{point} is not on the front");
+            assert!((point.y - 0.4 * point.z).abs() < 1e-6, "{point} is not on the front");
             assert!(image.shows(&camera, *point, 1e-6));
         }
         assert!(!image.shows(&camera, DVec3::new(0.0, 0.5, 0.0), 0.005), "the back is hidden");
