@@ -28,6 +28,7 @@ mod shape;
 mod testing;
 
 pub use deform::data::{DataTerm, PointDerivatives};
+pub use deform::outline::{OutlineTerm, OutlineView};
 pub use deform::settings::{DeformSettings, DeformSolver, FIRST_FRAMES};
 pub use deform::track::{DeformReport, DeformTracker};
 pub use error::{TrackError, TrackErrorKind};

@@ -17,7 +17,9 @@
 mod carry;
 pub(crate) mod data;
 mod normal;
+pub(crate) mod outline;
 mod regularizer;
 pub(crate) mod settings;
+mod silhouette;
 mod thickness;
 pub(crate) mod track;

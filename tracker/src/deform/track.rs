@@ -23,6 +23,8 @@ const LEAST_GAIN: f64 = 1e-5;
 /// Damping that keeps the matrix regular where neither image nor neighbour constrains a node, as a share of its mean
 /// diagonal, so that the unit of length does not matter.
 const LEAST_DAMPING: f64 = 1e-11;
+/// Longest step of [`DeformTracker::align`], in longest steps of [`DeformTracker::track`].
+const ALIGN_STEPS: f64 = 3.0;
 
 /// Report of the solver on one frame set.
 #[derive(Debug, Clone, PartialEq, Default)]
@@ -255,34 +257,11 @@ impl DeformTracker {
             }
         }
         for _ in 0..self.settings.iterations(self.frame) {
-            let mut gradient = vec![DVec3::ZERO; self.translations.len()];
-            let mut derivatives = std::mem::take(&mut self.derivatives);
-            let data_loss = data.derivatives(&self.displacement, &mut derivatives);
-            self.derivatives = derivatives;
-            let loss = data_loss? + self.prior(Some(&mut gradient));
-            if !loss.is_finite() {
-                report.poisoned = true;
+            let before = report.accepted;
+            self.iterate(data, &mut report)?;
+            if report.poisoned {
                 self.restore(start);
                 return Ok(report);
-            }
-            // Gauss-Newton has already reported the loss after its step.
-            if report.losses.len() == report.accepted {
-                report.losses.push(loss);
-            }
-            let mut by_data = vec![DVec3::ZERO; gradient.len()];
-            report.dropped += self.gather(&mut by_data);
-            for (sum, by_data) in gradient.iter_mut().zip(&by_data) {
-                *sum += *by_data;
-            }
-            let before = report.accepted;
-            match self.settings.solver {
-                DeformSolver::Paper { rate } => {
-                    let step: Vec<DVec3> = gradient.iter().map(|g| *g * -rate).collect();
-                    if self.step(&step).is_some() {
-                        report.accepted += 1;
-                    }
-                }
-                DeformSolver::GaussNewton { .. } => self.step_downhill(&gradient, loss, data, &mut report)?,
             }
             if report.accepted == before {
                 break;
@@ -302,6 +281,66 @@ impl DeformTracker {
         }
         self.frame += 1;
         Ok(report)
+    }
+
+    /// Moves the nodes towards another data term before [`Self::track`], with at most this many steps, and without counting as a frame
+    /// set.
+    ///
+    /// # Errors
+    /// Those of the data term; the state is then that of the last accepted step.
+    pub fn align<D: DataTerm>(&mut self, data: &mut D, iterations: usize) -> Result<DeformReport, D::Error> {
+        let mut report = DeformReport::default();
+        let (start, damping) = (self.translations.clone(), self.damping);
+        let max_step_m = self.settings.max_step_m;
+        self.regularizer.history = self.frame > 0;
+        self.damping = self.settings.damping;
+        self.settings.max_step_m = ALIGN_STEPS * max_step_m;
+        let mut result = Ok(());
+        for _ in 0..iterations {
+            let before = report.accepted;
+            result = self.iterate(data, &mut report);
+            if result.is_err() || report.accepted == before {
+                break;
+            }
+        }
+        self.damping = damping;
+        self.settings.max_step_m = max_step_m;
+        if report.poisoned {
+            self.restore(start);
+        }
+        result.map(|()| report)
+    }
+
+    /// Takes one step; [`DeformReport::poisoned`] where the loss is not finite.
+    fn iterate<D: DataTerm>(&mut self, data: &mut D, report: &mut DeformReport) -> Result<(), D::Error> {
+        let mut gradient = vec![DVec3::ZERO; self.translations.len()];
+        let mut derivatives = std::mem::take(&mut self.derivatives);
+        let data_loss = data.derivatives(&self.displacement, &mut derivatives);
+        self.derivatives = derivatives;
+        let loss = data_loss? + self.prior(Some(&mut gradient));
+        if !loss.is_finite() {
+            report.poisoned = true;
+            return Ok(());
+        }
+        // Gauss-Newton has already reported the loss after its step.
+        if report.losses.len() == report.accepted {
+            report.losses.push(loss);
+        }
+        let mut by_data = vec![DVec3::ZERO; gradient.len()];
+        report.dropped += self.gather(&mut by_data);
+        for (sum, by_data) in gradient.iter_mut().zip(&by_data) {
+            *sum += *by_data;
+        }
+        match self.settings.solver {
+            DeformSolver::Paper { rate } => {
+                let step: Vec<DVec3> = gradient.iter().map(|g| *g * -rate).collect();
+                if self.step(&step).is_some() {
+                    report.accepted += 1;
+                }
+                Ok(())
+            }
+            DeformSolver::GaussNewton { .. } => self.step_downhill(&gradient, loss, data, report),
+        }
     }
 
     /// Adds the data's gradient by the nodes and builds its matrix; returns the number of dropped Gaussians.

@@ -20,10 +20,10 @@ mod view_choice;
 
 use std::time::Instant;
 
-use flyrig_body::{DeformationGraph, GpuSkinner, Part, SurfaceGaussians, Template, coarsen};
+use flyrig_body::{DeformationGraph, GpuSkinner, Part, SkinWeights, SurfaceGaussians, Template, coarsen};
 use flyrig_gpu::{GpuContext, StorageBuffer};
 use flyrig_renderer::{BackwardRasterizer, ColorMeans, GaussianBuffers, GaussianGradients, ImageLoss};
-use flyrig_tracker::{DeformReport, DeformTracker};
+use flyrig_tracker::{DeformReport, DeformTracker, OutlineTerm, OutlineView};
 use flyrig_types::Camera;
 use glam::{DVec3, Vec3};
 
@@ -42,12 +42,20 @@ use view_choice::ViewChooser;
 /// remember where cloth was hold it there.
 const COLOR_RATE: f32 = 0.03;
 
+/// Parts whose outlines are matched. Elsewhere hats and ponytails, which the body lacks, pulled head and shoulders outwards.
+const OUTLINED: [Part; 2] = [Part::LeftLeg, Part::RightLeg];
+
 /// Tracked deformation of one person, and the buffers that it is solved with.
 #[derive(Debug)]
 pub struct Deformation {
     max_level: u32,
     color_weight: f32,
     most_views: usize,
+    outline_steps: usize,
+    /// Coarse Gaussians on the surface, canonical metres, and their skin weights.
+    points: (Vec<Vec3>, Vec<SkinWeights>),
+    /// Whether each of them may follow an outline.
+    is_loose: Vec<bool>,
     chooser: ViewChooser,
     tracker: DeformTracker,
     backward: BackwardRasterizer,
@@ -106,6 +114,7 @@ impl Deformation {
             max_level: options.max_level,
             color_weight: options.color_weight,
             most_views: options.views,
+            outline_steps: options.outline_steps,
             chooser: ViewChooser::default(),
             tracker,
             backward: BackwardRasterizer::new(gpu)?,
@@ -116,6 +125,8 @@ impl Deformation {
             colors: ColorMeans::new(gpu, &coarse.first_child, &coarse.children)?,
             posed: vec![GaussianBuffers::zeroed(gpu, count)?],
             spacing_m: coarse.spacing_m,
+            is_loose: coarse.gaussians.parts.iter().map(|part| OUTLINED.contains(part)).collect(),
+            points: (coarse.gaussians.positions, coarse.gaussians.skin),
             mesh: MeshMotion::new(template, surface, graph),
             gradients: Vec::new(),
             views: Vec::new(),
@@ -154,6 +165,7 @@ impl Deformation {
             return Ok(Default::default());
         }
         self.update_colors(&person);
+        self.align(&person, views);
         let mut images = Images::new(
             person,
             views,
@@ -181,6 +193,20 @@ impl Deformation {
         tracing::debug!(?report, "deformation");
         self.report = Some(report);
         Ok(DeformTimes { prepare, draw, derivatives, solve })
+    }
+
+    /// Moves the nodes towards the outlines of the masks, out of reach of the images' derivatives.
+    fn align(&mut self, person: &TrackedPerson<'_>, views: &[TrackedView<'_>]) {
+        if self.outline_steps == 0 {
+            return;
+        }
+        let started = Instant::now();
+        let outlines: Vec<OutlineView<'_>> = views.iter().map(TrackedView::outline).collect();
+        let bones = person.poses.iter().map(|pose| person.skeleton.world_from_canonical(pose)).collect();
+        let (points, skin) = &self.points;
+        let mut term = OutlineTerm::new((points, skin, self.spacing_m), &self.is_loose, &outlines, bones);
+        let Ok(report) = self.tracker.align(&mut term, self.outline_steps);
+        tracing::debug!(?report, took = ?started.elapsed(), "outlines");
     }
 
     /// Chooses the views that are compared, as ascending indices.

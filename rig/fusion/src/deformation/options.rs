@@ -26,6 +26,9 @@ pub struct DeformOptions {
     pub views: usize,
     /// Whether head, hands and feet are stiffer than the rest.
     pub stiff_parts: bool,
+    /// Most steps of the legs' clothes towards the outlines of the masks before the images are compared, whose derivatives reach a pixel
+    /// or two: a skirt swings farther between two frame sets. With 0, none.
+    pub outline_steps: usize,
 }
 
 impl DeformOptions {
@@ -38,6 +41,7 @@ impl DeformOptions {
             max_level: 0,
             views: 0,
             stiff_parts: false,
+            outline_steps: 0,
             ..Self::coarse(solver)
         }
     }
@@ -76,6 +80,7 @@ impl DeformOptions {
             max_level: WantedImage::MAX_LEVEL,
             views: 0,
             stiff_parts: true,
+            outline_steps: 2,
         }
     }
 }

@@ -4,6 +4,8 @@ use std::time::Duration;
 
 use flyrig_body::Skeleton;
 use flyrig_gpu::{GpuContext, StorageBuffer};
+use flyrig_renderer::UNKNOWN_RGBA;
+use flyrig_tracker::OutlineView;
 use flyrig_types::{Camera, Pose};
 
 /// One image that the person is compared with.
@@ -20,6 +22,19 @@ pub struct TrackedView<'a> {
     pub with_unknown: bool,
     /// Index into [`TrackedPerson::poses`] of the instant at which the image was taken.
     pub instant: usize,
+}
+
+impl TrackedView<'_> {
+    /// Returns the view as the outline term sees it.
+    pub fn outline(&self) -> OutlineView<'_> {
+        OutlineView {
+            camera: self.camera,
+            size: self.size,
+            rgba: self.rgba,
+            unknown: self.with_unknown.then_some(UNKNOWN_RGBA),
+            instant: self.instant,
+        }
+    }
 }
 
 /// The person at the instants of one frame set.
