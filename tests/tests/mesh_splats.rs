@@ -110,3 +110,23 @@ fn a_splat_file_becomes_a_closed_mesh_and_faults_are_refused() {
     refused(&["a.ply", "--steps", "7"], "leave out --steps");
     refused(&["take", "--unit", "mm"], "leave out --unit and --up");
 }
+
+/// Limits on the size of files stand for a full disk: the system refuses the same writes.
+#[cfg(unix)]
+#[test]
+fn a_full_disk_is_named_and_leaves_nothing_behind() {
+    let folder = tempfile::tempdir().unwrap();
+    write(&folder.path().join("a.ply"), &[0.0], 3000, 1.0);
+    // Blocks of 512 or 1024 bytes, as the shell counts.
+    for (blocks, name) in [(80, "surface/000000.ply"), (300, "mesh.obj")] {
+        let script =
+            format!("trap '' XFSZ; ulimit -f {blocks}; exec '{PROGRAM}' mesh a.ply --out full {}", SMALL.join(" "));
+        let failed = run("sh", &["-c", &script], folder.path()).unwrap();
+        assert_eq!(failed.code, Some(1), "{name}: {failed:?}");
+        let errors: Vec<&str> = failed.stderr.lines().filter(|line| !line.starts_with("mesh: opening")).collect();
+        assert!(errors.len() == 1 && errors[0].contains(name), "{name}: {}", failed.stderr);
+        assert!(errors[0].contains("File too large"), "{}", failed.stderr);
+        let left: Vec<_> = fs::read_dir(folder.path()).unwrap().map(|entry| entry.unwrap().file_name()).collect();
+        assert_eq!(left, ["a.ply"], "{name}");
+    }
+}

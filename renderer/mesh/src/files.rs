@@ -1,5 +1,6 @@
 //! Files of meshes for other programs. Every writer checks its input first and refuses it with one [`MeshFileError`].
 
+mod archive;
 mod glb;
 mod mesh_file;
 mod obj;

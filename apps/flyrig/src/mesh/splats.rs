@@ -17,7 +17,7 @@ use serde_json::json;
 use super::arguments::{LightKind, MeshArgs};
 use super::page::{ShownMesh, write_page};
 use super::units::{Unit, Up};
-use super::write::write_folder;
+use super::write::{create_surfaces, write_folder};
 
 /// Files of packed splats, which other programs unpack.
 const PACKED: [&str; 5] = ["spz", "sog", "splat", "ksplat", "lcc"];
@@ -102,7 +102,7 @@ impl Written<'_> {
     fn write_to(&self, folder: &Path) -> Result<()> {
         let SplatMesh { positions, normals, uvs, triangles, texture } = self.mesh;
         // In the file's own axes, metres.
-        std::fs::create_dir(folder.join("surface"))?;
+        create_surfaces(folder)?;
         write_mesh_ply(&folder.join("surface/000000.ply"), positions, normals, triangles, &[])?;
         let turn = self.args.up.unwrap_or(Up::Y).to_y();
         let turned = |vectors: &[Vec3]| -> Vec<Vec3> { vectors.iter().map(|vector| turn * *vector).collect() };

@@ -53,6 +53,15 @@ pub(super) fn write_folder(out: &Path, write_to: impl FnOnce(&Path) -> Result<()
         .with_context(|| format!("cannot rename {} to {}; the mesh is in the former", partial.display(), out.display()))
 }
 
+/// Creates the folder of the surfaces.
+///
+/// # Errors
+/// Names the folder.
+pub(super) fn create_surfaces(folder: &Path) -> Result<()> {
+    let surfaces = folder.join("surface");
+    std::fs::create_dir(&surfaces).with_context(|| format!("cannot create {}", surfaces.display()))
+}
+
 /// Folder that is written.
 pub(super) struct MeshFolder<'a> {
     pub out: &'a Path,
@@ -191,7 +200,7 @@ impl MeshFolder<'_> {
         let is_written =
             |number: u64| self.args.sequence || self.args.frame.is_some() || number.is_multiple_of(SURFACE_EVERY);
         if self.source.numbers.iter().any(|number| is_written(*number)) {
-            std::fs::create_dir(folder.join("surface"))?;
+            create_surfaces(folder)?;
         }
         if self.args.sequence {
             let (secs, turn): (Vec<f64>, _) = (self.source.seconds().collect(), self.source.y_up().as_quat());

@@ -4,12 +4,12 @@ use std::collections::HashMap;
 use std::io::{self, Write};
 use std::path::Path;
 
-use flyrig_types::write_whole;
 use glam::{DVec3, Vec3};
+use zip::CompressionMethod;
 use zip::write::SimpleFileOptions;
-use zip::{CompressionMethod, ZipWriter};
 
-use super::mesh_file::{MeshFile, MeshFileError, refused, system};
+use super::archive::write_archive;
+use super::mesh_file::{MeshFile, MeshFileError, refused};
 use crate::Connectivity;
 
 const TYPES: &str = r#"<?xml version="1.0" encoding="UTF-8"?>
@@ -34,19 +34,15 @@ pub fn write_3mf(path: &Path, mesh: &MeshFile<'_>) -> Result<(), MeshFileError> 
     mesh.check(path, "3mf")?;
     let points: Vec<Vec3> = mesh.positions.iter().map(|p| 1000.0 * Vec3::new(p.x, 0.0 - p.z, p.y)).collect();
     let (points, triangles) = solid(points, mesh.triangles).map_err(|message| refused(path, message))?;
-    write_whole(path, |out| {
-        let mut zip = ZipWriter::new(out);
+    write_archive(path, |archive| {
         let options = SimpleFileOptions::default().compression_method(CompressionMethod::Deflated);
         for (name, text) in [("[Content_Types].xml", TYPES), ("_rels/.rels", RELATIONS)] {
-            zip.start_file(name, options)?;
-            zip.write_all(text.as_bytes())?;
+            archive.start_file(name, options)?;
+            archive.write_all(text.as_bytes())?;
         }
-        zip.start_file("3D/3dmodel.model", options)?;
-        write_model(&mut io::BufWriter::new(&mut zip), &points, &triangles)?;
-        zip.finish()?;
-        Ok(())
+        archive.start_file("3D/3dmodel.model", options)?;
+        write_model(&mut io::BufWriter::new(archive), &points, &triangles)
     })
-    .map_err(system(path))
 }
 
 fn write_model(out: &mut impl Write, points: &[Vec3], triangles: &[[u32; 3]]) -> io::Result<()> {

@@ -3,11 +3,11 @@
 use std::io::{self, Write};
 use std::path::Path;
 
-use flyrig_types::write_whole;
+use zip::CompressionMethod;
 use zip::write::SimpleFileOptions;
-use zip::{CompressionMethod, ZipWriter};
 
-use super::mesh_file::{MeshFile, MeshFileError, system};
+use super::archive::write_archive;
+use super::mesh_file::{MeshFile, MeshFileError};
 use super::usd_skeleton::{write_skeleton, write_skin};
 use super::usd_text::{Times, write_extent, write_header, write_material, write_mesh_opening, write_vectors};
 
@@ -23,23 +23,20 @@ const TEXTURE: &str = "textures/color.png";
 /// [`MeshFileError`] for faulty content, and when the system fails.
 pub fn write_usdz(path: &Path, mesh: &MeshFile<'_>) -> Result<(), MeshFileError> {
     mesh.check(path, "usdz")?;
-    write_whole(path, |out| {
-        let mut zip = ZipWriter::new(out);
+    write_archive(path, |archive| {
         let options =
             SimpleFileOptions::default().compression_method(CompressionMethod::Stored).with_alignment(ALIGNMENT);
-        zip.start_file("mesh.usda", options)?;
-        let mut stage = io::BufWriter::new(&mut zip);
+        archive.start_file("mesh.usda", options)?;
+        let mut stage = io::BufWriter::new(&mut *archive);
         write_stage(&mut stage, mesh)?;
         stage.flush()?;
         drop(stage);
         if let Some(png) = mesh.texture {
-            zip.start_file(TEXTURE, options)?;
-            zip.write_all(png)?;
+            archive.start_file(TEXTURE, options)?;
+            archive.write_all(png)?;
         }
-        zip.finish()?;
         Ok(())
     })
-    .map_err(system(path))
 }
 
 fn write_stage(out: &mut impl Write, mesh: &MeshFile<'_>) -> io::Result<()> {
