@@ -1,6 +1,7 @@
 //! `flyrig mesh`: the person of a take, or an avatar, as a closed mesh with bones; or a splat file as one without.
 
 mod arguments;
+mod metrics;
 mod page;
 mod photos;
 mod source;

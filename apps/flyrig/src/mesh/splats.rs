@@ -15,6 +15,7 @@ use glam::Vec3;
 use serde_json::json;
 
 use super::arguments::{LightKind, MeshArgs};
+use super::metrics::Finished;
 use super::page::{ShownMesh, write_page};
 use super::units::{Unit, Up};
 use super::write::{create_surfaces, write_folder};
@@ -136,16 +137,18 @@ impl Written<'_> {
     }
 
     fn metrics(&self) -> serde_json::Value {
-        let mut metrics = self.of_gaussians();
-        if let (Some(all), Some(more)) = (metrics.as_object_mut(), self.of_surface().as_object_mut()) {
-            all.append(more);
-        }
-        metrics
-    }
-
-    fn of_gaussians(&self) -> serde_json::Value {
-        let (report, counts) = (self.report, &self.report.counts);
-        json!({
+        let SplatReport { mesh, counts, seconds: [viewed_s, simplified_s, textured_s], .. } = self.report;
+        let report = self.report;
+        let finished = Finished {
+            mesh,
+            topology: &report.topology,
+            simplified_by_m: report.simplified_by_m,
+            charts: report.charts,
+            coverage: report.coverage,
+            simplified_s: *simplified_s,
+            textured_s: *textured_s,
+        };
+        finished.metrics(json!({
             "splats": self.args.take.dataset.display().to_string(),
             "harmonics_degree": self.file.degree,
             "flat_gaussians": self.file.is_flat,
@@ -162,52 +165,13 @@ impl Written<'_> {
             "pixel_mm": 1e3 * report.pixel_m,
             "drawn_beyond_mm": 1e3 * report.drawn_beyond_m,
             "kept_vertices": report.kept_vertices,
-        })
-    }
-
-    fn of_surface(&self) -> serde_json::Value {
-        let (report, mesh) = (self.report, &self.report.mesh);
-        let (topology, seconds, [viewed_s, simplified_s, textured_s]) =
-            (&report.topology, &mesh.seconds, report.seconds);
-        json!({
             "points": mesh.points,
             "dropped_points": mesh.dropped.total(),
-            "vertices": topology.vertices,
-            "triangles": topology.triangles,
-            "closed_manifold": topology.is_closed_manifold(),
-            "components": topology.components,
-            "genus": topology.genus(),
-            "self_intersections": topology.self_intersections,
-            "area_m2": topology.area_m2,
-            "volume_m3": topology.volume_m3,
-            "fused_triangles": mesh.topology.triangles,
             "removed_components": mesh.removed.volumes_m3.len(),
-            "simplified_by_mm": 1e3 * report.simplified_by_m,
-            "charts": report.charts,
-            "texture_coverage": report.coverage,
             "unseen_texels": report.unseen_texels,
-            "hole_share": mesh.hole_share,
             "carved_voxels": mesh.emptied_voxels,
-            "voxel_mm": 1e3 * mesh.settings.voxel_m,
-            "truncation_mm": 1e3 * mesh.settings.truncation_m,
-            "angle_rad": mesh.settings.angle_rad,
-            "decay_mm": 1e3 * mesh.settings.decay_m,
-            "blocks": mesh.blocks,
-            "skipped_blocks": mesh.skipped_blocks,
-            "seconds": {
-                "views": viewed_s,
-                "density": seconds.density,
-                "fusion": seconds.fuse,
-                "signs": seconds.signs,
-                "carving": seconds.carve,
-                "surface": seconds.surface,
-                "components": seconds.components,
-                "topology": seconds.topology,
-                "simplification": simplified_s,
-                "texture": textured_s,
-                "all": self.seconds,
-            },
-        })
+            "seconds": { "views": viewed_s, "carving": mesh.seconds.carve, "all": self.seconds },
+        }))
     }
 
     fn print(&self) {

@@ -16,6 +16,7 @@ use serde_json::json;
 
 use super::{
     arguments::{LightKind, MeshArgs},
+    metrics::Finished,
     page::{ShownMesh, write_page},
     source::Source,
     texture::PhotoReport,
@@ -224,51 +225,32 @@ impl MeshFolder<'_> {
     }
 
     fn metrics(&self) -> serde_json::Value {
-        let (mesh, skin) = (&self.report.mesh, &self.report.skin);
-        let (topology, seconds, [simplified_s, tied_s, textured_s]) =
-            (&self.report.topology, &mesh.seconds, self.report.seconds);
-        json!({
+        let PersonReport { mesh, skin, .. } = self.report;
+        let [simplified_s, tied_s, textured_s] = self.report.seconds;
+        let finished = Finished {
+            mesh,
+            topology: &self.report.topology,
+            simplified_by_m: self.report.simplified_by_m,
+            charts: self.report.charts,
+            coverage: self.report.coverage,
+            simplified_s,
+            textured_s,
+        };
+        finished.metrics(json!({
             "take": self.args.take.dataset.display().to_string(),
             "gaussians": mesh.points,
             "dropped": mesh.dropped.total(),
-            "vertices": topology.vertices,
-            "triangles": topology.triangles,
-            "closed_manifold": topology.is_closed_manifold(),
-            "components": topology.components,
-            "genus": topology.genus(),
-            "self_intersections": topology.self_intersections,
-            "area_m2": topology.area_m2,
-            "volume_m3": topology.volume_m3,
-            "fused_triangles": mesh.topology.triangles,
-            "simplified_by_mm": 1e3 * self.report.simplified_by_m,
-            "charts": self.report.charts,
-            "texture_coverage": self.report.coverage,
             "texture_from_photographs": self.photos.seen,
             "held_out": self.held_out,
-            "hole_share": mesh.hole_share,
-            "voxel_mm": 1e3 * mesh.settings.voxel_m,
-            "truncation_mm": 1e3 * mesh.settings.truncation_m,
-            "angle_rad": mesh.settings.angle_rad,
-            "decay_mm": 1e3 * mesh.settings.decay_m,
-            "blocks": mesh.blocks,
-            "skipped_blocks": mesh.skipped_blocks,
             "skin": { "taken": skin.taken, "inpainted": skin.inpainted, "isolated": skin.isolated },
             "seconds": {
                 "tracking": self.source.tracked_s,
                 "fit": self.source.fitted_s,
-                "density": seconds.density,
-                "fusion": seconds.fuse,
-                "signs": seconds.signs,
-                "surface": seconds.surface,
-                "components": seconds.components,
-                "topology": seconds.topology,
-                "simplification": simplified_s,
                 "skin": tied_s,
-                "texture": textured_s,
                 "photographs": self.photos.seconds,
                 "all_after_tracking_and_fit": self.seconds,
             },
-        })
+        }))
     }
 
     fn print(&self) {
