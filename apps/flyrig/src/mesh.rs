@@ -2,6 +2,7 @@
 
 mod arguments;
 mod metrics;
+mod named;
 mod page;
 mod photos;
 mod source;

@@ -52,11 +52,6 @@ impl FromArgMatches for PerceptionArgs {
 }
 
 impl PerceptionArgs {
-    /// Returns whether the command line names the source of pose or masks.
-    pub fn is_named(&self) -> bool {
-        self.names_pose || self.names_masks
-    }
-
     /// Chooses the sources that the command line leaves open: given where the take has them for these cameras, else estimated.
     ///
     /// # Errors

@@ -5,6 +5,7 @@ use std::path::PathBuf;
 use anyhow::{Result, ensure};
 use clap::{Args, ValueEnum};
 
+use super::named::NamedOptions;
 use super::units::{Unit, Up};
 use crate::arguments::DatasetArgs;
 
@@ -13,9 +14,37 @@ const GAUSSIANS: u32 = 115_000;
 /// Default steps of the fit.
 const STEPS: u64 = 400;
 
+/// Options that apply to takes alone: names in the arguments' definition and on the command line.
+const OF_TAKES: [(&str, &str); 21] = [
+    ("inputs", "--inputs"),
+    ("frames", "--frames"),
+    ("frame", "--frame"),
+    ("fps", "--fps"),
+    ("holdout", "--holdout"),
+    ("pose", "--pose"),
+    ("masks", "--masks"),
+    ("shape", "--shape"),
+    ("hands", "--hands"),
+    ("people", "--people"),
+    ("network", "--network"),
+    ("height_m", "--height"),
+    ("floor_m", "--floor"),
+    ("key_color", "--key-color"),
+    ("plates", "--plates"),
+    ("solver", "--solver"),
+    ("by_camera", "--lag"),
+    ("trust_calibration", "--trust-calibration"),
+    ("sequence", "--sequence"),
+    ("steps", "--steps"),
+    ("gaussians", "--gaussians"),
+];
+
 /// Arguments of `flyrig mesh`.
 #[derive(Debug, Clone, Args)]
 pub struct MeshArgs {
+    // First, since the other fields take their options out of the matches.
+    #[command(flatten)]
+    named: NamedOptions,
     #[command(flatten)]
     pub take: DatasetArgs,
     /// Folder of the mesh; it must be new or empty.
@@ -69,24 +98,12 @@ impl MeshArgs {
     /// # Errors
     /// Names these options.
     pub(super) fn check_no_take(&self, kind: &str) -> Result<()> {
-        let take = &self.take;
-        let given = [
-            ("--inputs", !take.inputs.is_empty()),
-            ("--frames", take.range.frames.is_some()),
-            ("--frame", self.frame.is_some()),
-            ("--holdout", !self.holdout.is_empty()),
-            ("--pose or --masks", take.perception.is_named()),
-            ("--sequence", self.sequence),
-            ("--steps", self.steps != STEPS),
-            ("--gaussians", self.gaussians != GAUSSIANS),
-            ("--lag", !take.lags.by_camera.is_empty()),
-            ("--trust-calibration", take.trust.trust_calibration),
-        ];
-        let given: Vec<&str> = given.iter().filter(|(_, given)| *given).map(|(name, _)| *name).collect();
+        let given = OF_TAKES.iter().filter(|(name, _)| self.named.contains(name));
+        let given: Vec<&str> = given.map(|(_, option)| *option).collect();
         ensure!(
             given.is_empty(),
             "{} is {kind} and not a take: leave out {}",
-            take.dataset.display(),
+            self.take.dataset.display(),
             given.join(" and ")
         );
         Ok(())
@@ -115,5 +132,46 @@ fn parse_voxel(text: &str) -> Result<f32, String> {
     match text.parse::<f32>() {
         Ok(side) if (1.0..=50.0).contains(&side) => Ok(side / 1000.0),
         _ => Err(format!("'{text}' is not between 1 and 50 millimetres")),
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use clap::{ArgAction, Command, FromArgMatches as _};
+
+    use super::*;
+
+    /// Options for every input, and those that are checked elsewhere.
+    const OTHERS: [&str; 10] =
+        ["dataset", "out", "motion", "fusion", "voxel", "triangles", "texture", "light", "unit", "up"];
+
+    fn parsed(words: &[&str]) -> MeshArgs {
+        let command = MeshArgs::augment_args(Command::new("mesh"));
+        let words = [&["mesh", "a.flyavatar", "--out", "m"], words].concat();
+        MeshArgs::from_arg_matches_mut(&mut command.try_get_matches_from(words).unwrap()).unwrap()
+    }
+
+    #[test]
+    fn options_of_takes_are_refused_for_avatars_even_with_their_default() {
+        parsed(&["--voxel", "9", "--light", "baked", "--triangles", "60000"]).check_no_take("an avatar").unwrap();
+        let command = MeshArgs::augment_args(Command::new("mesh"));
+        let mut checked = Vec::new();
+        for argument in command.get_arguments().filter(|argument| !OTHERS.contains(&argument.get_id().as_str())) {
+            let option = format!("--{}", argument.get_long().unwrap());
+            let default = argument.get_default_values().first().map(|value| value.to_string_lossy().into_owned());
+            let value = match argument.get_id().as_str() {
+                "frames" => "0..4".to_owned(),
+                "by_camera" => "00=3".to_owned(),
+                "shape" => "given".to_owned(),
+                "height_m" => "1.7".to_owned(),
+                _ => default.unwrap_or_else(|| "7".to_owned()),
+            };
+            let takes_value = matches!(argument.get_action(), ArgAction::Set | ArgAction::Append);
+            let words = if takes_value { vec![option.as_str(), &value] } else { vec![option.as_str()] };
+            let error = parsed(&words).check_no_take("an avatar").unwrap_err().to_string();
+            assert_eq!(error, format!("a.flyavatar is an avatar and not a take: leave out {option}"));
+            checked.push(option);
+        }
+        assert_eq!(checked.len(), OF_TAKES.len(), "{checked:?}");
     }
 }
