@@ -1,10 +1,10 @@
 //! `flyrig mesh`: the person of a take, or an avatar, as a closed mesh with bones; or a splat file as one without.
 
 mod arguments;
+mod held_out;
 mod metrics;
 mod named;
 mod page;
-mod photos;
 mod source;
 mod splats;
 mod texture;
@@ -37,14 +37,17 @@ pub fn mesh(args: &MeshArgs, gpu: &dyn Fn() -> Result<GpuContext>) -> Result<()>
         return splats::mesh_file(args, mesh, gpu);
     }
     splats::check_no_splats(args)?;
-    let source = Source::open(args, gpu)?;
+    let mut source = Source::open(args, gpu)?;
     let started = Instant::now();
     let options = PersonOptions { mesh, triangles: args.triangles as usize, texture_side: args.texture };
     let (mut person, report) = MeshedPerson::of_avatar(&source.avatar, &options)
         .with_context(|| format!("no mesh of {}", args.take.dataset.display()))?;
     let photos = texture::photograph(&mut person, &source, args.light)?;
     let seconds = started.elapsed().as_secs_f64();
-    let held_out = texture::compare(&person, &source, args.light, gpu)?;
+    let held_out = match source.held_out.take() {
+        Some(cameras) => cameras.compare(&person, &source, args.light, gpu)?,
+        None => None,
+    };
     MeshFolder {
         out: &args.out,
         source: &source,

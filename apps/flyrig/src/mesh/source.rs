@@ -4,16 +4,16 @@ use std::time::Instant;
 
 use anyhow::{Context as _, Result, ensure};
 use flyrig_avatar::{Avatar, AvatarFitSettings, AvatarModel, TrainingFrame};
-use flyrig_fit::{Fit, FitSettings};
+use flyrig_fit::{Fit, FitSettings, TrainingView};
 use flyrig_fusion::BodySettings;
 use flyrig_gpu::GpuContext;
 use flyrig_renderer::HarmonicOrder;
 use flyrig_report::{progress_bar, stop};
-use flyrig_takes::AvatarTake;
+use flyrig_takes::{AvatarTake, frame_number};
 use flyrig_types::PoseTrack;
 use glam::{DQuat, DVec3};
 
-use super::{arguments::MeshArgs, photos::Photos};
+use super::{arguments::MeshArgs, held_out::HeldOut};
 use crate::avatar::{DrivenMotion, load, open_replay};
 
 /// Avatar, and the frames of its take.
@@ -29,8 +29,10 @@ pub(super) struct Source {
     pub motion: Option<PoseTrack>,
     /// Upward direction of the take's or the motion's world.
     pub up: DVec3,
-    /// Photographs of the take; none for an avatar from a file.
-    pub photos: Photos,
+    /// Images of the inputs, cropped to the person; none for an avatar from a file.
+    pub photos: Vec<TrainingView>,
+    /// Cameras of the take that are left out.
+    pub held_out: Option<HeldOut>,
     /// Seconds of tracking and of the fit.
     pub tracked_s: f64,
     pub fitted_s: f64,
@@ -52,7 +54,8 @@ impl Source {
                 numbers: Vec::new(),
                 fps: 30.0,
                 up: DVec3::Z,
-                photos: Photos::default(),
+                photos: Vec::new(),
+                held_out: None,
                 tracked_s: 0.0,
                 fitted_s: 0.0,
             });
@@ -86,22 +89,26 @@ impl Source {
         }
         let body = BodySettings { gaussians: args.gaussians as usize, ..BodySettings::default() };
         let mut replay = open_replay(&take_args, &args.holdout, (&body, None), gpu)?;
-        let mut photos = Photos::default();
-        let take = AvatarTake::track(&mut replay, &body, HarmonicOrder::Zero, |replay, set| {
-            photos.hold(replay, set, args.frame)
+        let mut found = Vec::new();
+        let take = AvatarTake::track(&mut replay, &body, HarmonicOrder::Zero, |_, set| {
+            found.push((frame_number(set), set.master_nanos));
+            Ok(())
         })
         .with_context(|| format!("no mesh of {}", take_args.dataset.display()))?;
         ensure!(!stop::requested(), "stopped; nothing was written");
         let take = match args.frame {
-            Some(frame) => take.only(frame)?,
+            Some(frame) => {
+                found.retain(|(number, _)| *number == frame);
+                take.only(frame)?
+            }
             None => take,
         };
-        photos.views.clone_from(&take.views);
+        let photos = take.views.clone();
         let AvatarTake { frames, views, avatar, numbers, .. } = take;
         let tracked_s = started.elapsed().as_secs_f64();
         println!("tracked {} frames in {tracked_s:.0} s", frames.len());
         let up = replay.session.rig().world_up;
-        drop(replay);
+        let held_out = HeldOut::of(replay, &found);
         let started = Instant::now();
         let avatar = if args.steps == 0 {
             avatar
@@ -118,7 +125,18 @@ impl Source {
             fit.into_model().into_avatar()
         };
         let fitted_s = started.elapsed().as_secs_f64();
-        Ok(Self { avatar, frames, motion: None, numbers, fps: take_args.rate.fps, up, photos, tracked_s, fitted_s })
+        Ok(Self {
+            avatar,
+            frames,
+            motion: None,
+            numbers,
+            fps: take_args.rate.fps,
+            up,
+            photos,
+            held_out,
+            tracked_s,
+            fitted_s,
+        })
     }
 }
 
