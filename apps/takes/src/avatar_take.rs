@@ -2,6 +2,7 @@
 
 use anyhow::{Context as _, Result, bail};
 use flyrig_avatar::{Avatar, KnownPoses, TrainingFrame};
+use flyrig_body::Template;
 use flyrig_fit::TrainingView;
 use flyrig_fusion::{BodySettings, Outcome, PersonId, person_surface};
 use flyrig_renderer::HarmonicOrder;
@@ -20,6 +21,8 @@ pub struct AvatarTake {
     pub views: Vec<TrainingView>,
     /// Initial avatar, which looks like the live rendering.
     pub avatar: Avatar,
+    /// Its body without clothes; `None` for one that wears none of its own surface.
+    pub undressed: Option<Template>,
     /// Texture coordinates of its Gaussians; empty if the template has none.
     pub uvs: Vec<Vec2>,
     /// Number of each of these frames, ascending; at least one.
@@ -72,7 +75,8 @@ impl AvatarTake {
         avatar.set_mean(frames.iter().map(|frame: &TrainingFrame| frame.translations.as_slice()));
         avatar.known_poses = KnownPoses::new(&poses);
         let camera = replay.session.rig().cameras.first().cloned().context("no camera")?;
-        Ok(Self { frames, views, avatar, uvs: surface.uvs, numbers, camera })
+        let undressed = (subject.body() != subject.template()).then(|| subject.body().clone());
+        Ok(Self { frames, views, avatar, undressed, uvs: surface.uvs, numbers, camera })
     }
 
     /// Returns the frame of this number alone, whose shape of clothes and hair becomes the avatar's mean.

@@ -35,6 +35,22 @@ pub struct MeshOptions<'a> {
     pub dense: bool,
 }
 
+impl MeshOptions<'_> {
+    /// Returns the settings that apply to points, from which distant ones were dropped.
+    ///
+    /// # Errors
+    /// As [`Density::measure`].
+    pub(crate) fn settings_of(&self, points: &OrientedPoints) -> Result<FusionSettings, MeshError> {
+        self.settings.map_or_else(|| Ok(self.derived(points, &Density::measure(points)?)), Ok)
+    }
+
+    /// Returns the settings for points of measured density.
+    fn derived(&self, points: &OrientedPoints, density: &Density) -> FusionSettings {
+        let settings = FusionSettings::from_density(points, density);
+        self.voxel_m.map_or(settings, |voxel_m| settings.with_voxel(voxel_m))
+    }
+}
+
 /// Seconds per stage of [`mesh_from_points`].
 #[derive(Debug, Clone, Copy, Default, PartialEq)]
 pub struct MeshSeconds {
@@ -99,11 +115,7 @@ pub fn mesh_from_points(mut points: OrientedPoints, options: &MeshOptions) -> Re
     }
     let mut seconds = MeshSeconds::default();
     let density = timed(&mut seconds.density, || Density::measure(&points))?;
-    let derived = || {
-        let settings = FusionSettings::from_density(&points, &density);
-        options.voxel_m.map_or(settings, |voxel_m| settings.with_voxel(voxel_m))
-    };
-    let settings = options.settings.unwrap_or_else(derived);
+    let settings = options.settings.unwrap_or_else(|| options.derived(&points, &density));
     let mut field = timed(&mut seconds.fuse, || fuse_blocks(&points, &settings, options.fusion, options.dense))?;
     let signed_voxels = timed(&mut seconds.signs, || close(&mut field, &Winding::new(&points, &density)))?;
     let emptied_voxels = timed(&mut seconds.carve, || options.empty.map_or(Ok(0), |empty| carve(&mut field, empty)))?;

@@ -81,7 +81,7 @@ pub use intersections::self_intersections;
 pub use marching_cubes::marching_cubes;
 pub use mesh::TriMesh;
 pub use normalization::{Normalization, clamped_scales};
-pub use person::{MeshedPerson, PersonError, PersonOptions, PersonReport};
+pub use person::{MeshedPerson, PersonError, PersonOptions, PersonReport, ShellReport};
 pub use points::{Dropped, OrientedPoint, OrientedPoints};
 pub use settings::{Fusion, FusionSettings};
 pub use signs::close;

@@ -9,12 +9,27 @@ use crate::triangle::closest_on_triangle;
 const LEAF: usize = 4;
 
 /// Triangles of a mesh, sorted into a tree of boxes.
+#[derive(Debug)]
 pub(crate) struct Surface {
-    triangles: Vec<[Vec3; 3]>,
+    /// Corners, and index in the mesh.
+    triangles: Vec<([Vec3; 3], u32)>,
     nodes: Vec<Node>,
 }
 
+/// Place on a surface that is nearest to a point.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub(crate) struct NearestPlace {
+    pub place: Vec3,
+    /// Squared distance from the point, square metres.
+    pub squared: f32,
+    /// Index of the triangle in the mesh.
+    pub triangle: u32,
+    /// Weights of its corners, sum 1.
+    pub barycentric: [f32; 3],
+}
+
 /// Box around a range of triangles. The first child of a node without triangles follows it.
+#[derive(Debug)]
 struct Node {
     low: Vec3,
     high: Vec3,
@@ -27,8 +42,13 @@ struct Node {
 impl Surface {
     /// Sorts the triangles of a mesh, whose indices must be in range.
     pub(crate) fn new(mesh: &TriMesh) -> Self {
-        let corners = |t: &[u32; 3]| t.map(|i| mesh.positions[i as usize]);
-        let mut surface = Self { triangles: mesh.triangles.iter().map(corners).collect(), nodes: Vec::new() };
+        Self::of(&mesh.positions, &mesh.triangles)
+    }
+
+    /// Sorts triangles, whose indices must be in range.
+    pub(crate) fn of(positions: &[Vec3], triangles: &[[u32; 3]]) -> Self {
+        let corners = |(t, i): (&[u32; 3], u32)| (t.map(|i| positions[i as usize]), i);
+        let mut surface = Self { triangles: triangles.iter().zip(0u32..).map(corners).collect(), nodes: Vec::new() };
         if !surface.triangles.is_empty() {
             surface.split(0, surface.triangles.len());
         }
@@ -37,16 +57,16 @@ impl Surface {
 
     fn split(&mut self, from: usize, to: usize) {
         let part = &mut self.triangles[from..to];
-        let points = part.as_flattened();
-        let low = points.iter().copied().fold(Vec3::INFINITY, Vec3::min);
-        let high = points.iter().copied().fold(Vec3::NEG_INFINITY, Vec3::max);
+        let points = || part.iter().flat_map(|(corners, _)| corners.iter().copied());
+        let low = points().fold(Vec3::INFINITY, Vec3::min);
+        let high = points().fold(Vec3::NEG_INFINITY, Vec3::max);
         let node = self.nodes.len();
         self.nodes.push(Node { low, high, range: from..to, second: 0 });
         if part.len() <= LEAF {
             return;
         }
         let axis = (high - low).max_position();
-        let center = |t: &[Vec3; 3]| t[0][axis] + t[1][axis] + t[2][axis];
+        let center = |(t, _): &([Vec3; 3], u32)| t[0][axis] + t[1][axis] + t[2][axis];
         let half = part.len() / 2;
         part.select_nth_unstable_by(half, |a, b| center(a).total_cmp(&center(b)));
         self.split(from, from + half);
@@ -57,32 +77,32 @@ impl Surface {
 
     /// Returns the distance from a point to the nearest triangle, metres; infinity without triangles.
     pub(crate) fn distance_m(&self, point: Vec3) -> f32 {
-        self.search(point).0.sqrt()
+        self.search(point).map_or(f32::INFINITY, |nearest| nearest.squared.sqrt())
     }
 
     /// Returns the place of the surface that is nearest to a point; the point without triangles.
     pub(crate) fn nearest(&self, point: Vec3) -> Vec3 {
-        self.search(point).1
+        self.search(point).map_or(point, |nearest| nearest.place)
     }
 
-    /// Returns the squared distance to the nearest place, and this place.
-    fn search(&self, point: Vec3) -> (f32, Vec3) {
+    /// Returns the nearest place; `None` without triangles, and for a point that is not finite.
+    pub(crate) fn search(&self, point: Vec3) -> Option<NearestPlace> {
         let to_box = |node: usize| {
             self.nodes.get(node).map_or(f32::INFINITY, |n| point.distance_squared(point.clamp(n.low, n.high)))
         };
-        let mut best = (f32::INFINITY, point);
+        let (mut least, mut best) = (f32::INFINITY, None);
         let mut open = vec![(to_box(0), 0)];
         while let Some((squared, i)) = open.pop() {
-            if squared >= best.0 {
+            if squared >= least {
                 continue;
             }
             let node = &self.nodes[i];
-            for triangle in &self.triangles[node.range.clone()] {
-                let weights = closest_on_triangle(point, *triangle);
-                let nearest: Vec3 = triangle.iter().zip(weights).map(|(corner, weight)| *corner * weight).sum();
-                let squared = point.distance_squared(nearest);
-                if squared < best.0 {
-                    best = (squared, nearest);
+            for (corners, triangle) in &self.triangles[node.range.clone()] {
+                let barycentric = closest_on_triangle(point, *corners);
+                let place: Vec3 = corners.iter().zip(barycentric).map(|(corner, weight)| *corner * weight).sum();
+                let squared = point.distance_squared(place);
+                if squared < least {
+                    (least, best) = (squared, Some(NearestPlace { place, squared, triangle: *triangle, barycentric }));
                 }
             }
             if node.range.is_empty() {

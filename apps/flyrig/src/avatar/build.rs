@@ -101,7 +101,7 @@ pub fn build(args: &AvatarBuildArgs, gpu: &GpuContext) -> Result<()> {
         return save_learnt(&args.take.dataset, &args.out);
     }
     let args = &AvatarBuildArgs { take: args.take.resolve("avatar build", &[], gpu)?, ..args.clone() };
-    let AvatarTake { frames, views, avatar, uvs, numbers, camera } = track(args, gpu)?;
+    let AvatarTake { frames, views, avatar, uvs, numbers, camera, .. } = track(args, gpu)?;
     let first = frames.first().cloned().context("no frame")?;
     let scene = AvatarScene::new(gpu, &avatar)?;
     let mut preview = Preview { scene, first, camera, path: args.out.with_extension("png") };

@@ -242,6 +242,13 @@ impl MeshFolder<'_> {
             "dropped": mesh.dropped.total(),
             "texture_from_photographs": self.photos.seen,
             "held_out": self.held_out,
+            "shell": self.report.shell.map(|shell| json!({
+                "wall_share": shell.wall_share,
+                "hidden_share": shell.hidden_share,
+                "thick_vertices": shell.thick_vertices,
+                "hollow_seconds": shell.seconds[0],
+                "thin_seconds": shell.seconds[1],
+            })),
             "skin": { "taken": skin.taken, "inpainted": skin.inpainted, "isolated": skin.isolated },
             "seconds": {
                 "tracking": self.source.tracked_s,
@@ -255,8 +262,15 @@ impl MeshFolder<'_> {
 
     fn print(&self) {
         let (mesh, topology) = (&self.report.mesh, &self.report.topology);
+        let shell = self.report.shell.map_or_else(String::new, |shell| {
+            format!(
+                ", {:.1} % is the inner side of the skirt and {:.1} % legs hidden by it",
+                100.0 * shell.wall_share,
+                100.0 * shell.hidden_share
+            )
+        });
         println!(
-            "{} triangles from {} Gaussians at voxels of {:.1} mm in {:.1} s; {:.1} % of the surface closes holes, {} self-intersections; {}",
+            "{} triangles from {} Gaussians at voxels of {:.1} mm in {:.1} s; {:.1} % of the surface closes holes{shell}, {} self-intersections; {}",
             topology.triangles,
             mesh.points,
             1e3 * mesh.settings.voxel_m,

@@ -1,7 +1,7 @@
 //! Nodes that move the vertices of a mesh, from the Gaussians beside them.
 
 use flyrig_avatar::{Hanging, PosedAvatar};
-use flyrig_body::{PointGrid, Template};
+use flyrig_body::PointGrid;
 use glam::Vec3;
 use rayon::prelude::*;
 
@@ -16,16 +16,16 @@ const WIDEST_M: f32 = 0.4;
 const SAME_SIDE: f32 = 0.2;
 
 /// Returns the nodes of each vertex: those of the nearest Gaussians on the same side, weighted by their inverse distance.
-pub(super) fn hang(mesh: &Template, of: &Hanging, posed: &PosedAvatar) -> Hanging {
+pub(super) fn hang((positions, normals): (&[Vec3], &[Vec3]), of: &Hanging, posed: &PosedAvatar) -> Hanging {
     let centers: Vec<Vec3> = posed.center.iter().map(|center| Vec3::from_slice(&center[..3])).collect();
-    let normals: Vec<Vec3> = posed.normals().collect();
+    let facing: Vec<Vec3> = posed.normals().collect();
     let grid = PointGrid::new(&centers, RADIUS_M);
     let row = |(position, normal): (&Vec3, &Vec3)| {
         let mut radius = RADIUS_M;
         let mut near = Vec::new();
         while near.is_empty() && radius < WIDEST_M && position.is_finite() {
             grid.within(*position, radius, |i, squared| {
-                if normals[i].dot(*normal) >= SAME_SIDE {
+                if facing[i].dot(*normal) >= SAME_SIDE {
                     near.push((squared, i));
                 }
             });
@@ -36,7 +36,7 @@ pub(super) fn hang(mesh: &Template, of: &Hanging, posed: &PosedAvatar) -> Hangin
         blend(of, &near)
     };
     let rows: Vec<([u32; NODES], [f32; NODES])> =
-        mesh.positions.par_iter().zip(&mesh.normals).with_min_len(256).map(row).collect();
+        positions.par_iter().zip(normals).with_min_len(256).map(row).collect();
     let (gaussian_nodes, gaussian_weights) = rows.into_iter().unzip();
     Hanging { nodes: of.nodes.clone(), gaussian_nodes, gaussian_weights, mean: of.mean.clone() }
 }

@@ -2,18 +2,23 @@
 
 mod hang;
 mod photograph;
+mod skirt;
 
 use std::time::Instant;
 
 use flyrig_avatar::{Atlas, Avatar, AvatarError, BakedMesh, Bones, DRAWN_BEYOND, Hanging, PosedAvatar};
-use flyrig_body::{Template, displacement, skin_mesh};
+use flyrig_body::{BodyError, Template, displacement, skin_mesh};
 use flyrig_types::Pose;
 use glam::{DVec3, Vec2, Vec3, Vec4};
 
 use crate::{
-    AtlasError, AtlasSettings, DecimateError, MeshAtlas, MeshError, MeshOptions, MeshReport, OrientedPoint,
-    OrientedPoints, SkinReport, SkinSettings, Topology, TriMesh, finish::finish, mesh_atlas, mesh_from_points,
-    person::hang::hang, skin_weights,
+    AtlasError, AtlasSettings, DecimateError, Empty, MeshAtlas, MeshError, MeshOptions, MeshReport, OrientedPoint,
+    OrientedPoints, SkinReport, SkinSettings, Topology, TriMesh,
+    finish::finish,
+    mesh_atlas, mesh_from_points,
+    person::hang::hang,
+    person::skirt::{Hollow, Side, StandIns},
+    skin::{Origin, skin_weights, skin_weights_by},
 };
 
 /// Mesh of a person that poses and a deformation graph move.
@@ -40,6 +45,11 @@ pub enum PersonError {
     /// The surface gets no texture coordinates.
     #[error(transparent)]
     Atlas(#[from] AtlasError),
+    /// The body that wears the avatar's clothes is not valid, or has another skeleton.
+    #[error(
+        "the body below the clothes does not belong to the avatar; leave it out, or take the one that was tracked: {0}"
+    )]
+    Undressed(#[from] BodyError),
     /// The texture cannot be made.
     #[error(transparent)]
     Texture(#[from] AvatarError),
@@ -54,11 +64,14 @@ pub struct PersonOptions<'a> {
     pub triangles: usize,
     /// Texels along a side of the texture.
     pub texture_side: u32,
+    /// Body of the avatar without its clothes, in the same canonical space: a skirt becomes a shell around its legs. Without it the mesh
+    /// closes a skirt at the hem.
+    pub undressed: Option<&'a Template>,
 }
 
 impl Default for PersonOptions<'_> {
     fn default() -> Self {
-        Self { mesh: MeshOptions::default(), triangles: 60_000, texture_side: 2048 }
+        Self { mesh: MeshOptions::default(), triangles: 60_000, texture_side: 2048, undressed: None }
     }
 }
 
@@ -79,6 +92,21 @@ pub struct PersonReport {
     pub mesh: MeshReport,
     /// Origin of the skin weights.
     pub skin: SkinReport,
+    /// Shell of a skirt; `None` without one.
+    pub shell: Option<ShellReport>,
+}
+
+/// Measures of a skirt that is a shell around the legs.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct ShellReport {
+    /// Share of the inner side of the skirt in the mesh's surface, 0..=1.
+    pub wall_share: f64,
+    /// Share of legs and hips below the skirt, which are those of the template, 0..=1.
+    pub hidden_share: f64,
+    /// Vertices of the inner side that keep the thickness of the cut, where a thinner wall would intersect itself.
+    pub thick_vertices: usize,
+    /// Seconds from the skirt's points to the space below it, and to thin the wall.
+    pub seconds: [f64; 2],
 }
 
 impl MeshedPerson {
@@ -90,17 +118,34 @@ impl MeshedPerson {
     pub fn of_avatar(avatar: &Avatar, options: &PersonOptions<'_>) -> Result<(Self, PersonReport), PersonError> {
         let mut posed = PosedAvatar::default();
         avatar.pose(&Bones::at_rest(&avatar.template.skeleton), None, &mut posed);
-        let (fused, mesh) = mesh_from_points(drawn_points(&posed), &options.mesh)?;
+        let points = drawn_points(&posed);
         let started = Instant::now();
-        let simple = finish(&fused, options.triangles, mesh.settings.spacing_m)?;
+        let hollow = match options.undressed {
+            Some(body) => hollow_of(avatar, body, &points, &options.mesh)?,
+            None => None,
+        };
+        let hollow_s = started.elapsed().as_secs_f64();
+        let given = options.mesh.empty;
+        let is_empty = |place: Vec3| {
+            hollow.as_ref().is_some_and(|hollow| hollow.is_empty(place)) || given.is_some_and(|empty| empty(place))
+        };
+        let empty: Option<Empty<'_>> = if hollow.is_some() { Some(&is_empty) } else { given };
+        let fusion = MeshOptions { empty, ..options.mesh };
+        let (fused, mesh) = mesh_from_points(OrientedPoints::from_rows(points), &fusion)?;
+        let started = Instant::now();
+        let mut simple = finish(&fused, options.triangles, mesh.settings.spacing_m)?;
         let simplified_s = started.elapsed().as_secs_f64();
+        let (sides, shell) = hollow.as_ref().map(|hollow| hollow.shell(&mut simple.mesh, hollow_s)).unzip();
         let started = Instant::now();
-        let (tied, skin) = Self::tie(&simple.mesh, avatar, &posed);
+        let inner = hollow.as_ref().zip(options.undressed).zip(sides.as_deref());
+        let (tied, skin, stand_ins) = Self::tie(&simple.mesh, avatar, &posed, inner);
         let tied_s = started.elapsed().as_secs_f64();
         let started = Instant::now();
         let atlas = mesh_atlas(&simple.mesh, AtlasSettings { side: options.texture_side, ..AtlasSettings::default() })?;
         let mut person = tied.split(&atlas);
+        let stand_ins = stand_ins.map(|of| (atlas.split(&of.positions), atlas.split(&of.normals)));
         let Template { positions, normals, uvs, triangles, .. } = &person.template;
+        let (positions, normals) = stand_ins.as_ref().map_or((positions, normals), |(p, n)| (p, n));
         person.texture = avatar.bake(BakedMesh { positions, normals, uvs, triangles }, options.texture_side)?;
         let report = PersonReport {
             topology: Topology::measure(&simple.mesh),
@@ -110,16 +155,33 @@ impl MeshedPerson {
             seconds: [simplified_s, tied_s, started.elapsed().as_secs_f64()],
             mesh,
             skin,
+            shell,
         };
         Ok((person, report))
     }
 
-    /// Ties a mesh in the rest pose to the avatar's skeleton and graph.
-    fn tie(mesh: &TriMesh, avatar: &Avatar, posed: &PosedAvatar) -> (Self, SkinReport) {
+    /// Ties a mesh in the rest pose to the avatar's skeleton and graph. Returns the places that stand in for those below a skirt.
+    fn tie(
+        mesh: &TriMesh,
+        avatar: &Avatar,
+        posed: &PosedAvatar,
+        inner: Option<((&Hollow, &Template), &[Side])>,
+    ) -> (Self, SkinReport, Option<StandIns>) {
         let normals = mesh.normals();
-        let at = (mesh.positions.as_slice(), normals.as_slice());
         let body = avatar.surface();
-        let (skin, report) = skin_weights(at, &mesh.triangles, &body, SkinSettings::default());
+        let stand_ins = inner.map(|((hollow, _), sides)| hollow.stand_ins(&mesh.positions, &normals, sides));
+        let at = stand_ins.as_ref().map_or((&*mesh.positions, &*normals), |of| (&*of.positions, &*of.normals));
+        let (skin, report) = match inner {
+            None => skin_weights(at, &mesh.triangles, &body, SkinSettings::default()),
+            Some(((_, undressed), sides)) => {
+                let of = |i: usize| match sides[i] {
+                    Side::Hidden => Origin { template: 1, normal: normals[i] },
+                    Side::Seen | Side::Wall => Origin { template: 0, normal: at.1[i] },
+                };
+                let settings = SkinSettings::default();
+                skin_weights_by(&mesh.positions, &mesh.triangles, &[&body, undressed], settings, of)
+            }
+        };
         let part = |skin: &flyrig_body::SkinWeights| {
             let strongest = skin.joints[0];
             let same = avatar.template.skin.iter().position(|known| known.joints[0] == strongest);
@@ -132,13 +194,13 @@ impl MeshedPerson {
             positions: mesh.positions.clone(),
             uvs: vec![Vec2::ZERO; mesh.positions.len()],
             triangles: mesh.triangles.clone(),
-            normals,
+            normals: normals.clone(),
             skin,
             parts,
             skeleton: avatar.template.skeleton.clone(),
         };
-        let hanging = avatar.hanging.as_ref().map(|of| hang(&template, of, posed));
-        (Self { template, hanging, texture: Atlas { side: 0, rgb: Vec::new(), covered: 0 } }, report)
+        let hanging = avatar.hanging.as_ref().map(|of| hang(at, of, posed));
+        (Self { template, hanging, texture: Atlas { side: 0, rgb: Vec::new(), covered: 0 } }, report, stand_ins)
     }
 
     /// Splits the vertices where charts of the texture meet.
@@ -182,14 +244,33 @@ impl MeshedPerson {
     }
 }
 
-/// Returns the surface that posed Gaussians draw.
-fn drawn_points(posed: &PosedAvatar) -> OrientedPoints {
-    OrientedPoints::from_rows(posed.surface_points().map(|point| OrientedPoint {
+/// Returns the surface that posed Gaussians draw, one point each.
+fn drawn_points(posed: &PosedAvatar) -> Vec<OrientedPoint> {
+    let drawn = posed.surface_points().map(|point| OrientedPoint {
         position: point.drawn(DRAWN_BEYOND),
         normal: point.normal,
         weight: point.opacity,
         uncertainty_m: point.thickness_m,
-    }))
+    });
+    drawn.collect()
+}
+
+/// Returns the space below an avatar's skirt, for the voxels that its points are fused in; `None` without a skirt.
+fn hollow_of(
+    avatar: &Avatar,
+    body: &Template,
+    points: &[OrientedPoint],
+    options: &MeshOptions<'_>,
+) -> Result<Option<Hollow>, PersonError> {
+    body.check()?;
+    avatar.template.check_same_joints(body)?;
+    if !Hollow::is_below(&avatar.template, body) {
+        return Ok(None);
+    }
+    let mut oriented = OrientedPoints::from_rows(points.iter().copied());
+    oriented.drop_distant();
+    let voxel_m = options.settings_of(&oriented)?.voxel_m;
+    Ok(Hollow::of(avatar, body, points, voxel_m))
 }
 
 #[cfg(test)]

@@ -51,19 +51,41 @@ pub fn skin_weights(
     template: &Template,
     settings: SkinSettings,
 ) -> (Vec<SkinWeights>, SkinReport) {
-    let closest = ClosestPoints::new(template);
+    let normal = |i: usize| normals.get(i).copied().unwrap_or_default();
+    skin_weights_by(positions, triangles, &[template], settings, |i| Origin { template: 0, normal: normal(i) })
+}
+
+/// Template that a vertex takes its weights from, and the direction in which the surface faces there.
+#[derive(Debug, Clone, Copy)]
+pub(crate) struct Origin {
+    /// Index of the template.
+    pub template: usize,
+    /// Unit normal.
+    pub normal: Vec3,
+}
+
+/// Returns skin weights as [`skin_weights`] does, from the template of each vertex's `origin`.
+pub(crate) fn skin_weights_by(
+    positions: &[Vec3],
+    triangles: &[[u32; 3]],
+    templates: &[&Template],
+    settings: SkinSettings,
+    origin: impl Fn(usize) -> Origin + Sync,
+) -> (Vec<SkinWeights>, SkinReport) {
+    let closest: Vec<(ClosestPoints, &Template)> =
+        templates.iter().map(|template| (ClosestPoints::new(template), *template)).collect();
     let cosine = settings.angle_rad.cos();
     let near = |(i, position): (usize, &Vec3)| {
-        let normal = normals.get(i).copied().unwrap_or_default();
-        let found =
-            closest.within(*position, settings.distance_m, |triangle| closest.normal(triangle).dot(normal) >= cosine);
-        found.and_then(|found| found.weights(template))
+        let Origin { template, normal } = origin(i);
+        let (closest, template) = closest.get(template)?;
+        let faces = |triangle| closest.normal(triangle).dot(normal) >= cosine;
+        closest.within(*position, settings.distance_m, faces).and_then(|found| found.weights(template))
     };
     let known: Vec<Option<SkinWeights>> = positions.par_iter().enumerate().with_min_len(256).map(near).collect();
     let filled = inpaint(positions, triangles, &known);
     let mut report = SkinReport::default();
     let mut weights = Vec::with_capacity(positions.len());
-    for ((known, filled), position) in known.iter().zip(filled).zip(positions) {
+    for (i, ((known, filled), position)) in known.iter().zip(filled).zip(positions).enumerate() {
         weights.push(match (known, filled) {
             (Some(known), _) => {
                 report.taken += 1;
@@ -75,7 +97,10 @@ pub fn skin_weights(
             }
             (None, None) => {
                 report.isolated += 1;
-                closest.nearest(*position).and_then(|found| found.weights(template)).unwrap_or_else(root)
+                let found = closest.get(origin(i).template).and_then(|(closest, template)| {
+                    closest.nearest(*position).and_then(|found| found.weights(template))
+                });
+                found.unwrap_or_else(root)
             }
         });
     }

@@ -1,0 +1,172 @@
+use flyrig_avatar::Attachment;
+use flyrig_body::{Outfit, ShapeParams, Shoes, Skirt, default_template, sample_surface};
+use flyrig_renderer::HarmonicOrder;
+use glam::DVec3;
+
+use super::*;
+use crate::{MeshedPerson, PersonOptions, PersonReport};
+
+const WORN: Skirt = Skirt { length: 0.6, flare: 0.2 };
+
+fn body() -> Template {
+    default_template(&ShapeParams::default()).unwrap()
+}
+
+fn avatar_of(dressed: &Template) -> Avatar {
+    let surface = sample_surface(dressed, 50_000, 5).unwrap();
+    Avatar::new(dressed, &surface.inset(), None, &[], HarmonicOrder::Zero).unwrap()
+}
+
+fn meshed(avatar: &Avatar, undressed: Option<&Template>) -> (MeshedPerson, PersonReport) {
+    let options = PersonOptions { triangles: 40_000, texture_side: 256, undressed, ..PersonOptions::default() };
+    MeshedPerson::of_avatar(avatar, &options).unwrap()
+}
+
+/// Returns the winding number of closed triangles, by the sum over all solid angles.
+fn winding(mesh: &Template, point: DVec3) -> f64 {
+    let angle = |t: &[u32; 3]| {
+        let [a, b, c] = t.map(|i| mesh.positions[i as usize].as_dvec3() - point);
+        let (la, lb, lc) = (a.length(), b.length(), c.length());
+        2.0 * a.dot(b.cross(c)).atan2(la * lb * lc + a.dot(b) * lc + b.dot(c) * la + c.dot(a) * lb)
+    };
+    mesh.triangles.iter().map(angle).sum::<f64>() / (2.0 * std::f64::consts::TAU)
+}
+
+/// Returns the distance to the nearest of points, metres.
+fn nearest(point: DVec3, others: impl Iterator<Item = Vec3>) -> f64 {
+    others.map(|other| other.as_dvec3().distance(point)).fold(f64::INFINITY, f64::min)
+}
+
+#[test]
+fn a_skirt_is_a_closed_shell_with_both_legs_in_it_and_without_a_lid() {
+    let body = body();
+    let outfit = Outfit { skirt: Some(WORN), shoes: Some(Shoes { sole_m: 0.02 }) };
+    let dressed = outfit.on(&body).unwrap();
+    let avatar = avatar_of(&dressed);
+    let (person, report) = meshed(&avatar, Some(&body));
+    let topology = &report.topology;
+    assert!(topology.is_closed_manifold() && topology.components == 1, "{topology:?}");
+    assert_eq!(topology.self_intersections, 0);
+    let shell = report.shell.unwrap();
+    assert!(shell.wall_share > 0.1 && shell.hidden_share > 0.02 && report.mesh.hole_share < 0.02, "{report:?}");
+    let (solid, before) = meshed(&avatar, None);
+    assert!(before.shell.is_none() && before.mesh.hole_share > 0.04, "{}", before.mesh.hole_share);
+
+    let worn = skirt_vertices(&dressed, &body);
+    let tube = || dressed.positions.iter().zip(&worn).filter(|(_, worn)| **worn).map(|(p, _)| *p);
+    let (hem, band) = (tube().map(|p| p.y).fold(9.0, f32::min), tube().map(|p| p.y).fold(-9.0, f32::max));
+    let skin = sample_surface(&body, 40_000, 3).unwrap().positions;
+    let sheet: Vec<Vec3> = person.template.positions.clone();
+    let (mut empty, mut legs, mut were_solid) = (0, [0, 0], 0);
+    for i in 0..1500u32 {
+        let fraction = |k: u32| f64::from((i * k) % 1499) / 1499.0;
+        let y = f64::from(hem) - 0.03 + fraction(7) * f64::from(band - hem - 0.2);
+        let point = DVec3::new(fraction(311) - 0.5, y, 0.8 * (fraction(83) - 0.5));
+        let (inside, to_skin) = (winding(&body, point) > 0.5, nearest(point, skin.iter().copied()));
+        if nearest(point, sheet.iter().copied()) < 0.012 {
+            continue;
+        }
+        let found = winding(&person.template, point);
+        assert!((found - found.round()).abs() < 0.01, "{found} at {point}");
+        if inside && to_skin > 0.03 {
+            assert!(found > 0.5, "no leg at {point}");
+            legs[usize::from(point.x > 0.0)] += 1;
+        } else if !inside && to_skin > 0.025 {
+            // Neither a lid nor a filling, inside of the skirt or outside.
+            assert!(found < 0.5, "solid at {point}");
+            empty += 1;
+            were_solid += usize::from(winding(&solid.template, point) > 0.5);
+        }
+    }
+    assert!(empty > 300 && were_solid > 30 && legs.iter().all(|count| *count > 5), "{empty} {were_solid} {legs:?}");
+
+    // The inner side lies just behind the outer one and moves with it.
+    let inner: Vec<usize> = (0..person.template.positions.len())
+        .filter(|i| {
+            let (p, n) = (person.template.positions[*i], person.template.normals[*i]);
+            p.y > hem + 0.05 && p.y < hem + 0.2 && Vec2::new(p.x, p.z).length() > 0.2 && n.dot(p.with_y(0.0)) < 0.0
+        })
+        .collect();
+    let mut off: Vec<f64> = Vec::new();
+    for i in inner.iter().step_by(11) {
+        let place = person.template.positions[*i];
+        let tube_at = (0..worn.len())
+            .filter(|k| worn[*k])
+            .min_by(|a, b| dressed.positions[*a].distance(place).total_cmp(&dressed.positions[*b].distance(place)));
+        let (own, other) = (person.template.skin[*i], dressed.skin[tube_at.unwrap()]);
+        let weight = |skin: flyrig_body::SkinWeights, joint: u16| -> f32 {
+            skin.joints.iter().zip(skin.weights).filter(|(known, _)| **known == joint).map(|(_, weight)| weight).sum()
+        };
+        for joint in other.joints {
+            assert!((weight(own, joint) - weight(other, joint)).abs() < 0.15, "{own:?} {other:?} at {place}");
+        }
+        let outwards = place.with_y(0.0).normalize();
+        let outer = person.template.positions.iter().zip(&person.template.normals);
+        off.push(nearest(place.as_dvec3(), outer.filter(|(_, n)| n.dot(outwards) > 0.5).map(|(p, _)| *p)));
+    }
+    off.sort_by(f64::total_cmp);
+    assert!(off.len() > 20 && off[off.len() / 2] < 0.009, "{off:?}");
+}
+
+#[test]
+fn bodies_without_a_skirt_keep_their_mesh_and_short_ones_stay_solid() {
+    let body = body();
+    let shod = Outfit { skirt: None, shoes: Some(Shoes { sole_m: 0.02 }) }.on(&body).unwrap();
+    let avatar = avatar_of(&shod);
+    let ((plain, _), (given, report)) = (meshed(&avatar, None), meshed(&avatar, Some(&body)));
+    assert!(report.shell.is_none() && plain.template == given.template && plain.texture == given.texture);
+    let jacket = avatar_of(&Skirt { length: 0.15, flare: 0.05 }.on(&body).unwrap());
+    assert!(meshed(&jacket, Some(&body)).1.shell.is_none());
+}
+
+#[test]
+fn the_same_bytes_come_out_of_one_thread_and_of_several() {
+    let body = body();
+    let avatar = avatar_of(&WORN.on(&body).unwrap());
+    let run = |threads: usize| {
+        let pool = rayon::ThreadPoolBuilder::new().num_threads(threads).build().unwrap();
+        let mesh = crate::MeshOptions { voxel_m: Some(0.016), ..crate::MeshOptions::default() };
+        let undressed = Some(&body);
+        let options = PersonOptions { mesh, triangles: 10_000, texture_side: 64, undressed };
+        pool.install(|| MeshedPerson::of_avatar(&avatar, &options).unwrap())
+    };
+    let ((one, first), (other, second)) = (run(1), run(3));
+    assert!(one.template == other.template && one.texture == other.texture);
+    let thick = |report: &PersonReport| report.shell.unwrap().thick_vertices;
+    assert_eq!(thick(&first), thick(&second));
+}
+
+#[test]
+fn poisoned_inputs_are_refused_or_left_out() {
+    let body = body();
+    let mut avatar = avatar_of(&WORN.on(&body).unwrap());
+    let options = |undressed| PersonOptions { texture_side: 256, undressed, ..PersonOptions::default() };
+    let mut damaged = body.clone();
+    damaged.positions[7].x = f32::NAN;
+    let error = MeshedPerson::of_avatar(&avatar, &options(Some(&damaged))).unwrap_err().to_string();
+    assert!(error.contains("body below the clothes") && error.contains("not a finite number"), "{error}");
+    let mut empty = body.clone();
+    empty.triangles.clear();
+    assert!(MeshedPerson::of_avatar(&avatar, &options(Some(&empty))).is_err());
+
+    let points = |avatar: &Avatar| -> Vec<OrientedPoint> {
+        let row = |place: &Vec3| OrientedPoint { position: *place, normal: *place, weight: 1.0, uncertainty_m: 0.0 };
+        avatar.places.iter().map(row).collect()
+    };
+    let mut bad = points(&avatar);
+    for (i, point) in bad.iter_mut().enumerate().step_by(3) {
+        point.position.x = if i % 2 == 0 { f32::NAN } else { f32::INFINITY };
+        point.normal = Vec3::ZERO;
+    }
+    let hollow = Hollow::of(&avatar, &body, &bad, 0.01).unwrap();
+    for point in [Vec3::NAN, Vec3::INFINITY, Vec3::splat(1e30), Vec3::new(0.0, f32::NAN, 0.0)] {
+        assert!(!hollow.is_empty(point), "{point}");
+        assert_eq!(hollow.side(point, Vec3::NAN), Side::Seen);
+    }
+    for voxel_m in [0.0, -1.0, f32::NAN, f32::INFINITY] {
+        assert!(Hollow::of(&avatar, &body, &points(&avatar), voxel_m).is_none(), "{voxel_m}");
+    }
+    assert!(Hollow::of(&avatar, &body, &[], 0.01).is_none());
+    avatar.attachments.fill(Attachment { triangle: u32::MAX, barycentric: [1.0, 0.0, 0.0] });
+    assert!(Hollow::of(&avatar, &body, &points(&avatar), 0.01).is_none(), "no point belongs to the skirt");
+}
