@@ -87,7 +87,7 @@ impl Hollow {
     /// it, valid and with the avatar's skeleton; `points` are those of the avatar's Gaussians, one each.
     pub fn of(avatar: &Avatar, body: &Template, points: &[OrientedPoint], voxel_m: f32) -> Option<Self> {
         let worn = skirt_vertices(&avatar.template, body);
-        if !worn.contains(&true) || !(voxel_m > 0.0 && voxel_m.is_finite()) {
+        if !(worn.contains(&true) && voxel_m > 0.0 && voxel_m.is_finite()) {
             return None;
         }
         let surface = avatar.surface();
