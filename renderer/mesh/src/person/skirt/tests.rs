@@ -127,7 +127,7 @@ fn the_same_bytes_come_out_of_one_thread_and_of_several() {
         let pool = rayon::ThreadPoolBuilder::new().num_threads(threads).build().unwrap();
         let mesh = crate::MeshOptions { voxel_m: Some(0.016), ..crate::MeshOptions::default() };
         let undressed = Some(&body);
-        let options = PersonOptions { mesh, triangles: 10_000, texture_side: 64, undressed };
+        let options = PersonOptions { mesh, triangles: 10_000, texture_side: 512, undressed };
         pool.install(|| MeshedPerson::of_avatar(&avatar, &options).unwrap())
     };
     let ((one, first), (other, second)) = (run(1), run(3));
