@@ -46,7 +46,7 @@ pub fn mesh(args: &MeshArgs, gpu: &dyn Fn() -> Result<GpuContext>) -> Result<()>
     let photos = texture::photograph(&mut person, &source, args.light)?;
     let seconds = started.elapsed().as_secs_f64();
     let held_out = match source.held_out.take() {
-        Some(cameras) => cameras.compare(&person, &source, args.light, gpu)?,
+        Some(cameras) => cameras.compare(&person, (&source.avatar, &source.frames), args.light, gpu)?,
         None => None,
     };
     MeshFolder {

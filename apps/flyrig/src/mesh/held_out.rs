@@ -1,7 +1,7 @@
 //! Cameras of a take that are left out of everything and then compared with the textured mesh and with the Gaussians.
 
 use anyhow::{Result, ensure};
-use flyrig_avatar::DetailedScene;
+use flyrig_avatar::{Avatar, DetailedScene, TrainingFrame};
 use flyrig_gpu::GpuContext;
 use flyrig_mesh::{DrawnMesh, MeshedPerson, draw_textured};
 use flyrig_metrics::{CameraScore, ScoreSheet, score_view};
@@ -10,7 +10,7 @@ use flyrig_takes::{Replay, TruthReader};
 use flyrig_types::{Camera, RenderedView};
 use serde_json::json;
 
-use super::{arguments::LightKind, source::Source};
+use super::arguments::LightKind;
 
 /// Frames from one compared with held-out cameras to the next.
 const EVERY: u64 = 10;
@@ -40,25 +40,25 @@ impl HeldOut {
         (!cameras.is_empty()).then(|| Self { cameras, images, frames: chosen(frames) })
     }
 
-    /// Returns the mean scores of the textured mesh and of the Gaussians; `None` without a frame to compare.
+    /// Returns the mean scores of the textured mesh and of the avatar's Gaussians; `None` without a frame to compare. `frames` are all frames
+    /// of the take in which the person was found.
     ///
     /// # Errors
     /// Names the image that cannot be read; the device fails, or the person asks to stop.
     pub fn compare(
         mut self,
         person: &MeshedPerson,
-        source: &Source,
+        (avatar, frames): (&Avatar, &[TrainingFrame]),
         light: LightKind,
         gpu: &dyn Fn() -> Result<GpuContext>,
     ) -> Result<Option<serde_json::Value>> {
-        let avatar = &source.avatar;
         let (mut mesh, mut gaussians) = (ScoreSheet::default(), ScoreSheet::default());
         if self.frames.is_empty() {
             return Ok(None);
         }
         let mut scene = DetailedScene::new(&gpu()?.fastest(), avatar.clone(), true)?;
         for HeldFrame { at, number, nanos } in self.frames {
-            let Some(frame) = source.frames.get(at) else { continue };
+            let Some(frame) = frames.get(at) else { continue };
             let (positions, normals) = person.posed(&frame.pose, Some(&frame.translations));
             let shades = (light == LightKind::Removed).then(|| MeshedPerson::shades(&avatar.light, &normals));
             let drawn = DrawnMesh {
