@@ -86,7 +86,7 @@ pub use shape::ShapeParams;
 pub use shoes::Shoes;
 pub use skeleton::{Joint, Skeleton};
 pub use skinning::{skin_jacobian_f64, skin_mesh, skin_normal_f64, skin_point_f64};
-pub use skirt::Skirt;
+pub use skirt::{Skirt, hangs_from_hips};
 pub use surface::{DEFAULT_GAUSSIAN_COUNT, SurfaceGaussians, attached_surface, sample_surface};
 pub use template::{Part, SkinWeights, Template};
 pub use vertex_means::VertexMeans;

@@ -16,6 +16,9 @@ const OVERLAP_M: f32 = 0.05;
 const CLEARANCE_M: f32 = 0.004;
 /// Fraction of the thighs' movement that a skirt follows at the knees; less above.
 const FOLLOWS_THIGHS: f32 = 0.8;
+/// Distance below the hip joints at which legs no longer follow the hips, metres, and least share of the hips in what hangs from them.
+const BELOW_HIPS_M: f32 = 0.2;
+const LEAST_OF_HIPS: f32 = 0.1;
 /// Half of the width over which the weights blend from left to right, metres.
 const BLEND_M: f32 = 0.12;
 
@@ -92,6 +95,18 @@ impl Skirt {
         add_rings::<AROUND>(&mut dressed, &points, Part::Torso, |point| legs.weights(point));
         dressed.check()?;
         Ok(dressed)
+    }
+}
+
+/// Returns whether a point of a surface, canonical metres, hangs from the hips as a skirt does: well below the hip joints it still follows the
+/// hips. Trousers do not. False for a skeleton without hips, thighs and feet by the usual names.
+pub fn hangs_from_hips(skeleton: &Skeleton) -> impl Fn(Vec3, &SkinWeights) -> bool + use<> {
+    let legs = Legs::new(skeleton);
+    move |point, skin| {
+        legs.as_ref().is_some_and(|legs| {
+            let of_hips = skin.joints.iter().zip(skin.weights).filter(|(joint, _)| **joint == legs.hips);
+            point.y < legs.hip_y - BELOW_HIPS_M && of_hips.map(|(_, weight)| weight).sum::<f32>() > LEAST_OF_HIPS
+        })
     }
 }
 
@@ -207,6 +222,24 @@ mod tests {
         let raised = last.clone().map(|i| after[i].z - before[i].z).fold(f32::NEG_INFINITY, f32::max);
         assert!(raised > 0.1, "{raised}");
         assert!(after.iter().all(|p| p.is_finite()));
+    }
+
+    #[test]
+    fn a_skirt_hangs_from_the_hips_and_legs_do_not() {
+        let body = body();
+        let dressed = Skirt { length: 0.8, flare: 0.3 }.on(&body).unwrap();
+        let hangs = hangs_from_hips(&body.skeleton);
+        let count = |template: &Template| {
+            template.positions.iter().zip(&template.skin).filter(|(point, skin)| hangs(**point, skin)).count()
+        };
+        assert_eq!(count(&body), 0);
+        let legs = Legs::new(&body.skeleton).unwrap();
+        let rings = dressed.positions.iter().rev().take(AROUND * 8);
+        assert!(rings.clone().all(|point| point.y < legs.hip_y - 0.2), "the lower rings are the last");
+        assert!(count(&dressed) >= AROUND * 8, "{}", count(&dressed));
+        assert!(!hangs(Vec3::NAN, &dressed.skin[0]));
+        let nameless = Skeleton::new(vec![]).map(|skeleton| hangs_from_hips(&skeleton)(Vec3::ZERO, &dressed.skin[0]));
+        assert!(!nameless.unwrap_or(false));
     }
 
     #[test]

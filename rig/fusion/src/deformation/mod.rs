@@ -20,7 +20,9 @@ mod view_choice;
 
 use std::time::Instant;
 
-use flyrig_body::{DeformationGraph, GpuSkinner, Part, SkinWeights, SurfaceGaussians, Template, coarsen};
+use flyrig_body::{
+    DeformationGraph, GpuSkinner, Part, SkinWeights, SurfaceGaussians, Template, coarsen, hangs_from_hips,
+};
 use flyrig_gpu::{GpuContext, StorageBuffer};
 use flyrig_renderer::{BackwardRasterizer, ColorMeans, GaussianBuffers, GaussianGradients, ImageLoss};
 use flyrig_tracker::{DeformReport, DeformTracker, OutlineTerm, OutlineView};
@@ -41,9 +43,6 @@ use view_choice::ViewChooser;
 /// Share of the last painting's colours in those that are compared. Painting follows the surface wherever it slides; colours that
 /// remember where cloth was hold it there.
 const COLOR_RATE: f32 = 0.03;
-
-/// Parts whose outlines are matched. Elsewhere hats and ponytails, which the body lacks, pulled head and shoulders outwards.
-const OUTLINED: [Part; 2] = [Part::LeftLeg, Part::RightLeg];
 
 /// Tracked deformation of one person, and the buffers that it is solved with.
 #[derive(Debug)]
@@ -110,11 +109,16 @@ impl Deformation {
         if let Some(mean) = mean {
             tracker = tracker.with_mean(mean)?;
         }
+        // Elsewhere images are finer than outlines, and hats and ponytails, which the body lacks, pull head and shoulders outwards.
+        let hangs = hangs_from_hips(&template.skeleton);
+        let hung = coarse.gaussians.positions.iter().zip(&coarse.gaussians.skin);
+        let is_loose: Vec<bool> = hung.map(|(point, skin)| hangs(*point, skin)).collect();
+        let outline_steps = if is_loose.contains(&true) { options.outline_steps } else { 0 };
         let mut deformation = Self {
             max_level: options.max_level,
             color_weight: options.color_weight,
             most_views: options.views,
-            outline_steps: options.outline_steps,
+            outline_steps,
             chooser: ViewChooser::default(),
             tracker,
             backward: BackwardRasterizer::new(gpu)?,
@@ -125,7 +129,7 @@ impl Deformation {
             colors: ColorMeans::new(gpu, &coarse.first_child, &coarse.children)?,
             posed: vec![GaussianBuffers::zeroed(gpu, count)?],
             spacing_m: coarse.spacing_m,
-            is_loose: coarse.gaussians.parts.iter().map(|part| OUTLINED.contains(part)).collect(),
+            is_loose,
             points: (coarse.gaussians.positions, coarse.gaussians.skin),
             mesh: MeshMotion::new(template, surface, graph),
             gradients: Vec::new(),
@@ -195,7 +199,7 @@ impl Deformation {
         Ok(DeformTimes { prepare, draw, derivatives, solve })
     }
 
-    /// Moves the nodes towards the outlines of the masks, out of reach of the images' derivatives.
+    /// Moves a skirt towards the outlines of the masks, out of reach of the images' derivatives.
     fn align(&mut self, person: &TrackedPerson<'_>, views: &[TrackedView<'_>]) {
         if self.outline_steps == 0 {
             return;

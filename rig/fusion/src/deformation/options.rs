@@ -26,8 +26,8 @@ pub struct DeformOptions {
     pub views: usize,
     /// Whether head, hands and feet are stiffer than the rest.
     pub stiff_parts: bool,
-    /// Most steps of the legs' clothes towards the outlines of the masks before the images are compared, whose derivatives reach a pixel
-    /// or two: a skirt swings farther between two frame sets. With 0, none.
+    /// Most steps of a skirt towards the outlines of the masks before the images are compared, whose derivatives reach a pixel or
+    /// two: it swings farther between two frame sets. With 0, none.
     pub outline_steps: usize,
 }
 
