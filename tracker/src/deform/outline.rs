@@ -97,13 +97,6 @@ impl<'a> OutlineTerm<'a> {
         Self { points, skin, is_loose, views, bones, stride, spacing_m, matches: Vec::new() }
     }
 
-    /// Returns the distances of the last matches at these displacements, metres.
-    #[must_use]
-    pub fn distances(&self, displacement: &[[f32; 4]]) -> Vec<f64> {
-        let distance = |found: &Match| Some(found.distance(self.place(found, displacement)?)?.0);
-        self.matches.iter().filter_map(distance).collect()
-    }
-
     fn place(&self, found: &Match, displacement: &[[f32; 4]]) -> Option<DVec3> {
         self.world(found.gaussian, self.bones.get(found.instant)?, displacement)
     }

@@ -8,8 +8,8 @@ const MARGIN: usize = 6;
 const MOST_CELLS: f64 = 4096.0;
 /// Cells beyond a rim that must be free.
 const CLEAR_CELLS: [f64; 3] = [1.5, 2.5, 3.5];
-/// Least length of the coverage's gradient at a rim, per cell; that of a straight edge is 0.2.
-const LEAST_SLOPE: f64 = 0.08;
+/// Least distance of the centre of mass around a rim's cell, cells; a straight edge puts it one and a half inside.
+const LEAST_INWARDS: f64 = 0.56;
 
 /// Grid over the image, in cells about as wide as the points' distance.
 #[derive(Debug)]
@@ -106,7 +106,7 @@ impl Silhouette {
         if at(-1, 0) && at(1, 0) && at(0, -1) && at(0, 1) {
             return None;
         }
-        // Centre of mass of the 7x7 cells around; a straight edge through the middle puts it one cell and a half inside.
+        // Centre of mass of the 7x7 cells around.
         let (mut mass, mut moment) = (0.0, DVec2::ZERO);
         for dy in -3..=3 {
             for dx in -3..=3 {
@@ -117,7 +117,7 @@ impl Silhouette {
             }
         }
         let inwards = moment / mass;
-        (inwards.length() > LEAST_SLOPE * 7.0).then(|| -inwards.normalize())
+        (inwards.length() > LEAST_INWARDS).then(|| -inwards.normalize())
     }
 }
 
