@@ -31,7 +31,7 @@ use flyrig_report::{
 };
 use flyrig_takes::{Replay, ReplaySettings, dataset};
 use flyrig_tracker::PoseSettings;
-use flyrig_types::{Frame, FrameSet, Pose};
+use flyrig_types::{Camera, Frame, FrameSet, Pose};
 use glam::DVec3;
 use serde::Serialize;
 
@@ -79,6 +79,9 @@ pub struct BenchPerceptionArgs {
     pub surface: GaussiansArgs,
 }
 
+/// Joint that the others hang from.
+const HIPS: &str = "Hips";
+
 /// Sources of the pose, the shape and the masks.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize)]
 struct Inputs {
@@ -108,6 +111,10 @@ struct Row {
     lost: u64,
     joint_mean_mm: f64,
     joint_p95_mm: f64,
+    /// Mean error of the joints relative to the hips, and of the hips along the line of sight of the first input: a single camera does not
+    /// measure how far away a person is.
+    from_hips_mm: f64,
+    hips_depth_mm: f64,
     /// Mean change of the error of a joint from frame to frame.
     jitter_mm: f64,
     /// Mean error by joint.
@@ -193,7 +200,8 @@ fn run(args: &BenchPerceptionArgs, folder: &Path, inputs: Inputs, gpu: &GpuConte
         frames += 1;
         let Some(subject) = replay.session.subject(person).filter(|_| outcome == Outcome::Updated) else { continue };
         if let Some(pose) = subject.pose() {
-            joints.add(subject.template(), pose, &truth.template, &track.at(set.master_nanos));
+            let eye = replay.session.rig().cameras.first().map(Camera::position);
+            joints.add((subject.template(), pose), (&truth.template, &track.at(set.master_nanos)), eye);
         }
         for (view, camera) in replay.session.viewed(person).iter().enumerate() {
             let Some(frame) = frame_of(&set, camera.id.as_str()) else { continue };
@@ -225,6 +233,8 @@ fn run(args: &BenchPerceptionArgs, folder: &Path, inputs: Inputs, gpu: &GpuConte
         lost: replay.session.counts.lost,
         joint_mean_mm: joints.mean_mm(),
         joint_p95_mm: joints.percentile_mm(0.95),
+        from_hips_mm: joints.from_hips_mm(),
+        hips_depth_mm: mean(&joints.hips_depth_mm),
         jitter_mm: joints.jitter_mm(),
         joints_mm: joints.by_joint_mm(),
         turns_deg: joints.turns_deg(),
@@ -261,11 +271,22 @@ struct JointErrors {
     by_joint: BTreeMap<String, Vec<DVec3>>,
     /// Angles to the true orientation by joint and frame, degrees.
     turns: BTreeMap<String, Vec<f64>>,
+    /// Absolute error of the hips along the line of sight of a camera, by frame, millimetres.
+    hips_depth_mm: Vec<f64>,
 }
 
 impl JointErrors {
-    fn add(&mut self, template: &Template, pose: &Pose, truth: &Template, true_pose: &Pose) {
+    /// Adds a pose and the true one, of a body each. `eye` is the place of a camera, world metres.
+    fn add(
+        &mut self,
+        (template, pose): (&Template, &Pose),
+        (truth, true_pose): (&Template, &Pose),
+        eye: Option<DVec3>,
+    ) {
         let (ours, theirs) = (places(&template.skeleton, pose), places(&truth.skeleton, true_pose));
+        if let (Some(ours), Some(theirs), Some(eye)) = (ours.get(HIPS), theirs.get(HIPS), eye) {
+            self.hips_depth_mm.push(1e3 * (ours.0 - theirs.0).dot((theirs.0 - eye).normalize_or_zero()).abs());
+        }
         for name in JOINTS {
             if let (Some(ours), Some(theirs)) = (ours.get(name), theirs.get(name)) {
                 self.by_joint.entry(name.to_owned()).or_default().push(1e3 * (ours.0 - theirs.0));
@@ -285,6 +306,16 @@ impl JointErrors {
 
     fn percentile_mm(&self, share: f64) -> f64 {
         percentile(&self.all(), share)
+    }
+
+    fn from_hips_mm(&self) -> f64 {
+        let Some(hips) = self.by_joint.get(HIPS) else { return f64::NAN };
+        let others = self.by_joint.iter().filter(|(name, _)| *name != HIPS);
+        mean(
+            &others
+                .flat_map(|(_, errors)| errors.iter().zip(hips).map(|(e, hips)| e.distance(*hips)))
+                .collect::<Vec<_>>(),
+        )
     }
 
     fn by_joint_mm(&self) -> BTreeMap<String, f64> {
@@ -308,8 +339,8 @@ fn lengths(vectors: &[DVec3]) -> Vec<f64> {
 
 fn table(rows: &[Row]) -> String {
     let mut text = String::from(
-        "| data | pose | shape | masks | joints mm | p95 | jitter | shape mm | mask IoU | boundary F | alpha in band | PSNR dB | SSIM | FLIP | \
-         IoU | lost | ms per frame set |\n|---|---|---|---|---|---|---|---|---|---|---|---|---|---|---|---|---|\n",
+        "| data | pose | shape | masks | joints mm | p95 | from hips | hips depth | jitter | shape mm | mask IoU | boundary F | alpha in band | PSNR dB | SSIM | FLIP | \
+         IoU | lost | ms per frame set |\n|---|---|---|---|---|---|---|---|---|---|---|---|---|---|---|---|---|---|---|\n",
     );
     for row in rows {
         let name = |origin| if origin == Origin::Given { "given" } else { "estimated" };
@@ -319,13 +350,15 @@ fn table(rows: &[Row]) -> String {
         );
         let MaskErrors { iou, boundary_f, band_alpha, .. } = row.masks;
         text += &format!(
-            "| {} | {} | {} | {} | {:.1} | {:.1} | {:.1} | {} | {iou:.4} | {boundary_f:.3} | {band_alpha:.3} | {view} | {} | {:.0} |\n",
+            "| {} | {} | {} | {} | {:.1} | {:.1} | {:.1} | {:.1} | {:.1} | {} | {iou:.4} | {boundary_f:.3} | {band_alpha:.3} | {view} | {} | {:.0} |\n",
             row.dataset,
             name(row.inputs.pose),
             name(row.inputs.shape),
             name(row.inputs.masks),
             row.joint_mean_mm,
             row.joint_p95_mm,
+            row.from_hips_mm,
+            row.hips_depth_mm,
             row.jitter_mm,
             row.shape_mm.map_or_else(|| "-".to_owned(), |mm| format!("{mm:.1}")),
             row.lost,
@@ -333,4 +366,27 @@ fn table(rows: &[Row]) -> String {
         );
     }
     text
+}
+
+#[cfg(test)]
+#[allow(clippy::unwrap_used)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_body_that_is_too_far_away_is_right_relative_to_its_hips() {
+        let body = default_template(&ShapeParams::default()).unwrap();
+        let truth = body.skeleton.rest_pose();
+        let mut pose = truth.clone();
+        pose.root_translation += DVec3::new(0.03, 0.0, 0.1);
+        let hips = places(&body.skeleton, &truth)[HIPS].0;
+        let mut errors = JointErrors::default();
+        errors.add((&body, &pose), (&body, &truth), Some(hips - 3.0 * DVec3::Z));
+        assert!(errors.from_hips_mm() < 1e-6 && (errors.mean_mm() - 10900.0f64.sqrt()).abs() < 1e-6, "{errors:?}");
+        assert!((mean(&errors.hips_depth_mm) - 100.0).abs() < 1e-6, "{errors:?}");
+        assert!(JointErrors::default().from_hips_mm().is_nan());
+        // Without a camera there is no line of sight.
+        errors.add((&body, &pose), (&body, &truth), None);
+        assert_eq!(errors.hips_depth_mm.len(), 1);
+    }
 }

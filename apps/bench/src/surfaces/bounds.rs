@@ -67,9 +67,7 @@ mod tests {
     fn true_depths_from_all_sides_return_the_surface_and_one_camera_does_not() {
         let body = default_template(&ShapeParams::default()).unwrap();
         let points = Points::on(&body.positions, &body.triangles, 100_000);
-        let is_seen = vec![true; points.points.len()];
-        let truth =
-            TrueSurface { positions: body.positions.clone(), triangles: body.triangles.clone(), points, is_seen };
+        let truth = TrueSurface::new(body.positions.clone(), body.triangles.clone(), points, &[]);
         let cameras = cameras_around(&truth.positions);
         let chamfer = |cameras: &[Camera]| {
             let mesh = mesh_of_depths(&truth, cameras).unwrap();

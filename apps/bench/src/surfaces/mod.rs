@@ -4,6 +4,7 @@ mod bounds;
 mod depth;
 mod score;
 mod true_surface;
+mod visibility;
 
 use std::{fmt::Write as _, path::PathBuf, time::Instant};
 

@@ -6,7 +6,7 @@ use glam::Vec3;
 use rayon::prelude::*;
 use serde::Serialize;
 
-use super::true_surface::TrueSurface;
+use super::{true_surface::TrueSurface, visibility::seen_by};
 use crate::harness::surface::Points;
 
 /// Points spread over a surface that is scored.
@@ -25,6 +25,8 @@ pub(super) struct SurfaceScore {
     pub unseen_mm: f64,
     /// Mean of accuracy and completeness.
     pub chamfer_mm: f64,
+    /// Chamfer of what cameras on all sides see of either surface: the truth has no legs under a long skirt, and a mesh may have them.
+    pub outer_mm: f64,
     /// Mean absolute cosine between the normals of nearest points, both ways.
     pub normals: f64,
     /// Harmonic means of the shares of both surfaces that lie within 5 and 10 mm of each other.
@@ -38,9 +40,11 @@ impl SurfaceScore {
         let ours = Points::on(positions, triangles, POINTS);
         let to_truth = Matches::of(&ours, &truth.points);
         let to_ours = Matches::of(&truth.points, &ours);
-        let is_seen = || truth.is_seen.iter().copied().step_by(EVERY);
+        let every = |flags: &[bool]| -> Vec<bool> { flags.iter().copied().step_by(EVERY).collect() };
         let accuracy_mm = to_truth.mean_mm(|_| true, &[]);
-        let seen: Vec<bool> = is_seen().collect();
+        let seen = every(&truth.is_seen);
+        let our_outer = every(&seen_by(&truth.around, positions, triangles, &ours));
+        let outer = [(&to_truth, our_outer), (&to_ours, every(&truth.is_outer))];
         let completeness_mm = to_ours.mean_mm(|_| true, &seen);
         let score = |within_m: f32| {
             let (precision, recall) = (to_truth.share(within_m), to_ours.share(within_m));
@@ -52,6 +56,7 @@ impl SurfaceScore {
             seen_mm: to_ours.mean_mm(|seen| seen, &seen),
             unseen_mm: to_ours.mean_mm(|seen| !seen, &seen),
             chamfer_mm: 0.5 * (accuracy_mm + completeness_mm),
+            outer_mm: 0.5 * outer.map(|(matches, flags)| matches.mean_mm(|outer| outer, &flags)).iter().sum::<f64>(),
             normals: 0.5 * (to_truth.normals() + to_ours.normals()),
             f5: score(0.005),
             f10: score(0.010),
@@ -68,6 +73,7 @@ impl SurfaceScore {
             seen_mm: mean(|score| score.seen_mm),
             unseen_mm: mean(|score| score.unseen_mm),
             chamfer_mm: mean(|score| score.chamfer_mm),
+            outer_mm: mean(|score| score.outer_mm),
             normals: mean(|score| score.normals),
             f5: mean(|score| score.f5),
             f10: mean(|score| score.f10),
@@ -75,7 +81,8 @@ impl SurfaceScore {
     }
 
     /// Names of the columns of [`Self::cells`].
-    pub const COLUMNS: &str = "accuracy | completeness | seen | unseen | chamfer | normals | F 5 mm | F 10 mm";
+    pub const COLUMNS: &str =
+        "accuracy | completeness | seen | unseen | chamfer | outer chamfer | normals | F 5 mm | F 10 mm";
 
     /// Returns the columns of a table.
     pub fn cells(&self) -> String {
@@ -84,7 +91,8 @@ impl SurfaceScore {
         for length in lengths {
             let _ = write!(text, "{length:.2} | ");
         }
-        let _ = write!(text, "**{:.2}** | {:.3} | {:.3} | {:.3}", self.chamfer_mm, self.normals, self.f5, self.f10);
+        let _ = write!(text, "**{:.2}** | {:.2} | ", self.chamfer_mm, self.outer_mm);
+        let _ = write!(text, "{:.3} | {:.3} | {:.3}", self.normals, self.f5, self.f10);
         text
     }
 }
@@ -121,6 +129,7 @@ impl Matches {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::surfaces::visibility::tests::add_cube;
 
     /// Square of 1 m in the plane of x and y.
     fn square(z: f32) -> (Vec<Vec3>, Vec<[u32; 3]>) {
@@ -132,7 +141,7 @@ mod tests {
         let (positions, triangles) = square(0.0);
         let points = Points::on(&positions, &triangles, 100_000);
         let is_seen = points.points.iter().map(|point| point.x < 0.5).collect();
-        TrueSurface { positions, triangles, points, is_seen }
+        TrueSurface { is_seen, ..TrueSurface::new(positions, triangles, points, &[]) }
     }
 
     #[test]
@@ -140,7 +149,8 @@ mod tests {
         let truth = truth();
         let (positions, triangles) = square(0.007);
         let score = SurfaceScore::of(&positions, &triangles, &truth);
-        for length in [score.accuracy_mm, score.completeness_mm, score.seen_mm, score.unseen_mm, score.chamfer_mm] {
+        let SurfaceScore { accuracy_mm, completeness_mm, seen_mm, unseen_mm, chamfer_mm, outer_mm, .. } = score;
+        for length in [accuracy_mm, completeness_mm, seen_mm, unseen_mm, chamfer_mm, outer_mm] {
             assert!((length - 7.0).abs() < 0.2, "{score:?}");
         }
         assert!(score.normals > 0.999 && score.f5 < 1e-9 && score.f10 > 0.99, "{score:?}");
@@ -157,6 +167,20 @@ mod tests {
         assert!(score.accuracy_mm < 2.5 && score.seen_mm < 2.5, "{score:?}");
         assert!(score.unseen_mm > 100.0 && (score.chamfer_mm - score.completeness_mm / 2.0).abs() < 1.5, "{score:?}");
         assert!((score.f10 - 2.0 / 3.0).abs() < 0.02, "all of ours and half of the truth: {score:?}");
+    }
+
+    #[test]
+    fn what_is_hidden_counts_for_accuracy_alone() {
+        let mut cube = Default::default();
+        add_cube(0.5, &mut cube);
+        let (positions, triangles) = cube.clone();
+        let points = Points::on(&positions, &triangles, 100_000);
+        let truth = TrueSurface::new(positions, triangles, points, &[]);
+        add_cube(0.4, &mut cube);
+        let score = SurfaceScore::of(&cube.0, &cube.1, &truth);
+        // 3.84 of 9.84 square metres are 100 mm inside.
+        assert!((score.accuracy_mm - 39.0).abs() < 3.0 && score.completeness_mm < 5.0, "{score:?}");
+        assert!(score.outer_mm < 5.0, "{score:?}");
     }
 
     #[test]

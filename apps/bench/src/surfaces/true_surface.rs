@@ -6,13 +6,11 @@ use anyhow::{Context as _, Result, bail, ensure};
 use flyrig_types::Camera;
 use glam::Vec3;
 
-use super::depth::DepthImage;
+use super::{bounds::cameras_around, visibility::seen_by};
 use crate::harness::surface::Points;
 
 /// Points spread over a true surface.
 const POINTS: usize = 300_000;
-/// Points farther behind the nearest surface than this are hidden, metres.
-const HIDDEN_M: f64 = 0.005;
 
 /// True surface of one frame.
 pub(super) struct TrueSurface {
@@ -21,9 +19,19 @@ pub(super) struct TrueSurface {
     pub points: Points,
     /// Whether an input camera sees the point.
     pub is_seen: Vec<bool>,
+    /// Cameras on all sides, and whether one of them sees the point: the rest is hidden from everybody, like legs under a long skirt.
+    pub around: Vec<Camera>,
+    pub is_outer: Vec<bool>,
 }
 
 impl TrueSurface {
+    /// Collects what cameras see of the points of a surface.
+    pub fn new(positions: Vec<Vec3>, triangles: Vec<[u32; 3]>, points: Points, cameras: &[Camera]) -> Self {
+        let around = cameras_around(&positions);
+        let [is_seen, is_outer] = [cameras, around.as_slice()].map(|by| seen_by(by, &positions, &triangles, &points));
+        Self { positions, triangles, points, is_seen, around, is_outer }
+    }
+
     /// Reads `truth/surface/NNNNNN.ply` of a take, world metres. `cameras` decide on what is seen.
     ///
     /// # Errors
@@ -36,15 +44,7 @@ impl TrueSurface {
         let (positions, triangles) = parse(&bytes).with_context(|| format!("{} is damaged", path.display()))?;
         let points = Points::on(&positions, &triangles, POINTS);
         ensure!(!points.points.is_empty(), "{} has no surface", path.display());
-        let mut is_seen = vec![false; points.points.len()];
-        for camera in cameras {
-            let depths = DepthImage::render(camera, &positions, &triangles);
-            for ((seen, point), normal) in is_seen.iter_mut().zip(&points.points).zip(&points.normals) {
-                let faces = normal.as_dvec3().dot(camera.position() - point.as_dvec3()) > 0.0;
-                *seen |= faces && depths.shows(camera, point.as_dvec3(), HIDDEN_M);
-            }
-        }
-        Ok(Self { positions, triangles, points, is_seen })
+        Ok(Self::new(positions, triangles, points, cameras))
     }
 }
 
