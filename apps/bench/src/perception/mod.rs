@@ -249,15 +249,21 @@ fn run(args: &BenchPerceptionArgs, folder: &Path, inputs: Inputs, gpu: &GpuConte
     let list = |values: &BTreeMap<String, f64>| {
         values.iter().map(|(n, v)| format!("{n} {v:.0}")).collect::<Vec<_>>().join(", ")
     };
-    if let (Some(ours), Some(average), Some(subject)) = (row.shape_mm, row.average_shape_mm, subject) {
-        let [height, true_height] = [subject.body(), &truth.template].map(bind_pose::height_m);
-        eprintln!(
-            "  body at rest: {ours:.1} mm from the true one, the average body's {average:.1} mm; {height:.3} m tall, \
-             truth {true_height:.3} m"
-        );
+    if let Some(subject) = subject {
+        print_body(&row, subject.body(), &truth.template);
     }
     eprintln!("  mm: {}\n  degrees: {}", list(&row.joints_mm), list(&row.turns_deg));
     Ok(row)
+}
+
+/// Prints how far the estimated body at rest is from the true one.
+fn print_body(row: &Row, body: &Template, truth: &Template) {
+    let (Some(ours), Some(average)) = (row.shape_mm, row.average_shape_mm) else { return };
+    let [height, true_height] = [body, truth].map(bind_pose::height_m);
+    eprintln!(
+        "  body at rest: {ours:.1} mm from the true one, the average body's {average:.1} mm; {height:.3} m tall, \
+         truth {true_height:.3} m"
+    );
 }
 
 fn frame_of<'a>(set: &'a FrameSet, camera: &str) -> Option<&'a Frame> {

@@ -23,9 +23,10 @@ use glam::Vec3;
 use serde::Serialize;
 
 use crate::harness::arguments::RecordedArgs;
-use bounds::{cameras_around, mesh_of_depths};
+use bounds::mesh_of_depths;
 use score::SurfaceScore;
 use true_surface::TrueSurface;
+use visibility::cameras_around;
 
 /// Arguments of the command.
 #[derive(Debug, Args)]

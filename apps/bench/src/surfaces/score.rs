@@ -129,7 +129,6 @@ impl Matches {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::surfaces::visibility::tests::add_cube;
 
     /// Square of 1 m in the plane of x and y.
     fn square(z: f32) -> (Vec<Vec3>, Vec<[u32; 3]>) {
@@ -167,20 +166,6 @@ mod tests {
         assert!(score.accuracy_mm < 2.5 && score.seen_mm < 2.5, "{score:?}");
         assert!(score.unseen_mm > 100.0 && (score.chamfer_mm - score.completeness_mm / 2.0).abs() < 1.5, "{score:?}");
         assert!((score.f10 - 2.0 / 3.0).abs() < 0.02, "all of ours and half of the truth: {score:?}");
-    }
-
-    #[test]
-    fn what_is_hidden_counts_for_accuracy_alone() {
-        let mut cube = Default::default();
-        add_cube(0.5, &mut cube);
-        let (positions, triangles) = cube.clone();
-        let points = Points::on(&positions, &triangles, 100_000);
-        let truth = TrueSurface::new(positions, triangles, points, &[]);
-        add_cube(0.4, &mut cube);
-        let score = SurfaceScore::of(&cube.0, &cube.1, &truth);
-        // 3.84 of 9.84 square metres are 100 mm inside.
-        assert!((score.accuracy_mm - 39.0).abs() < 3.0 && score.completeness_mm < 5.0, "{score:?}");
-        assert!(score.outer_mm < 5.0, "{score:?}");
     }
 
     #[test]

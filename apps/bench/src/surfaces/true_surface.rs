@@ -6,7 +6,7 @@ use anyhow::{Context as _, Result, bail, ensure};
 use flyrig_types::Camera;
 use glam::Vec3;
 
-use super::{bounds::cameras_around, visibility::seen_by};
+use super::visibility::{cameras_around, seen_by};
 use crate::harness::surface::Points;
 
 /// Points spread over a true surface.

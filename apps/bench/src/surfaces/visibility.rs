@@ -1,7 +1,7 @@
-//! Which points of a surface cameras see.
+//! What cameras see of a surface, and virtual cameras on all sides of it.
 
-use flyrig_types::Camera;
-use glam::Vec3;
+use flyrig_types::{Camera, Intrinsics, Isometry};
+use glam::{DVec3, Vec3};
 use rayon::prelude::*;
 
 use super::depth::DepthImage;
@@ -9,6 +9,11 @@ use crate::harness::surface::Points;
 
 /// Points farther behind the nearest surface than this are hidden, metres.
 const HIDDEN_M: f64 = 0.005;
+/// Virtual cameras around a person, and their pixels along a side.
+const AROUND: usize = 24;
+const SIDE: u32 = 512;
+/// Distance of virtual cameras from the person's centre, in its largest extents.
+const DISTANCE: f64 = 2.5;
 
 /// Returns whether one of the cameras sees each point, which lies on the surface and faces it. World metres.
 pub(super) fn seen_by(cameras: &[Camera], positions: &[Vec3], triangles: &[[u32; 3]], points: &Points) -> Vec<bool> {
@@ -23,13 +28,35 @@ pub(super) fn seen_by(cameras: &[Camera], positions: &[Vec3], triangles: &[[u32;
     points.points.par_iter().zip(&points.normals).map(is_seen).collect()
 }
 
+/// Returns virtual cameras evenly around a surface, above and below it too.
+pub(super) fn cameras_around(positions: &[Vec3]) -> Vec<Camera> {
+    let finite = || positions.iter().filter(|position| position.is_finite());
+    let low = finite().fold(Vec3::INFINITY, |low, position| low.min(*position)).as_dvec3();
+    let high = finite().fold(Vec3::NEG_INFINITY, |high, position| high.max(*position)).as_dvec3();
+    if !low.is_finite() {
+        return Vec::new();
+    }
+    let (center, extent) = (0.5 * (low + high), (high - low).max_element());
+    let focal_px = f64::from(SIDE) * DISTANCE / 1.2;
+    let camera = |i: usize| {
+        // Fibonacci's spiral.
+        let z = 1.0 - (2.0 * i as f64 + 1.0) / AROUND as f64;
+        let (sin, cos) = (i as f64 * 2.399_963_229_728_653).sin_cos();
+        let away = DVec3::new((1.0 - z * z).sqrt() * cos, (1.0 - z * z).sqrt() * sin, z);
+        let up = if away.z.abs() > 0.9 { DVec3::X } else { DVec3::Z };
+        let pose = Isometry::look_at(center + away * extent * DISTANCE, center, up);
+        Camera::new(format!("around{i:02}"), Intrinsics::pinhole(SIDE, SIDE, focal_px), pose)
+    };
+    (0..AROUND).map(camera).collect()
+}
+
 #[cfg(test)]
-pub(super) mod tests {
+mod tests {
     use super::*;
-    use crate::surfaces::bounds::cameras_around;
+    use crate::surfaces::{score::SurfaceScore, true_surface::TrueSurface};
 
     /// Appends a cube around the origin, outward.
-    pub fn add_cube(half: f32, (positions, triangles): &mut (Vec<Vec3>, Vec<[u32; 3]>)) {
+    fn add_cube(half: f32, (positions, triangles): &mut (Vec<Vec3>, Vec<[u32; 3]>)) {
         let first = positions.len() as u32;
         positions.extend((0..8u32).map(|i| {
             let side = |bit: u32| if i & bit == 0 { -half } else { half };
@@ -56,5 +83,19 @@ pub(super) mod tests {
         };
         assert!(share(true) > 0.99 && share(false) < 1e-9, "{} {}", share(true), share(false));
         assert!(seen_by(&[], &positions, &triangles, &points).iter().all(|seen| !seen));
+    }
+
+    #[test]
+    fn what_is_hidden_counts_for_accuracy_alone() {
+        let mut cube = Default::default();
+        add_cube(0.5, &mut cube);
+        let (positions, triangles) = cube.clone();
+        let points = Points::on(&positions, &triangles, 100_000);
+        let truth = TrueSurface::new(positions, triangles, points, &[]);
+        add_cube(0.4, &mut cube);
+        let score = SurfaceScore::of(&cube.0, &cube.1, &truth);
+        // 3.84 of 9.84 square metres are 100 mm inside.
+        assert!((score.accuracy_mm - 39.0).abs() < 3.0 && score.completeness_mm < 5.0, "{score:?}");
+        assert!(score.outer_mm < 5.0, "{score:?}");
     }
 }
