@@ -233,7 +233,7 @@ fn run(args: &BenchPerceptionArgs, folder: &Path, inputs: Inputs, gpu: &GpuConte
         lost: replay.session.counts.lost,
         joint_mean_mm: joints.mean_mm(),
         joint_p95_mm: joints.percentile_mm(0.95),
-        from_hips_mm: joints.from_hips_mm(),
+        from_hips_mm: joints.mean_from_hips_mm(),
         hips_depth_mm: mean(&joints.hips_depth_mm),
         jitter_mm: joints.jitter_mm(),
         joints_mm: joints.by_joint_mm(),
@@ -314,7 +314,7 @@ impl JointErrors {
         percentile(&self.all(), share)
     }
 
-    fn from_hips_mm(&self) -> f64 {
+    fn mean_from_hips_mm(&self) -> f64 {
         let Some(hips) = self.by_joint.get(HIPS) else { return f64::NAN };
         let others = self.by_joint.iter().filter(|(name, _)| *name != HIPS);
         mean(
@@ -388,9 +388,9 @@ mod tests {
         let hips = places(&body.skeleton, &truth)[HIPS].0;
         let mut errors = JointErrors::default();
         errors.add((&body, &pose), (&body, &truth), Some(hips - 3.0 * DVec3::Z));
-        assert!(errors.from_hips_mm() < 1e-6 && (errors.mean_mm() - 10900.0f64.sqrt()).abs() < 1e-6, "{errors:?}");
+        assert!(errors.mean_from_hips_mm() < 1e-6 && (errors.mean_mm() - 10900.0f64.sqrt()).abs() < 1e-6, "{errors:?}");
         assert!((mean(&errors.hips_depth_mm) - 100.0).abs() < 1e-6, "{errors:?}");
-        assert!(JointErrors::default().from_hips_mm().is_nan());
+        assert!(JointErrors::default().mean_from_hips_mm().is_nan());
         // Without a camera there is no line of sight.
         errors.add((&body, &pose), (&body, &truth), None);
         assert_eq!(errors.hips_depth_mm.len(), 1);
