@@ -30,7 +30,6 @@ pub(super) fn mesh_of_depths(truth: &TrueSurface, cameras: &[Camera]) -> Result<
 #[allow(clippy::unwrap_used)]
 mod tests {
     use flyrig_body::{ShapeParams, default_template};
-
     use glam::Vec3;
 
     use super::*;
