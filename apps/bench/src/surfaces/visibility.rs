@@ -1,4 +1,4 @@
-//! What cameras see of a surface, and virtual cameras on all sides of it.
+//! Visibility of a surface from cameras, and virtual cameras on all sides of it.
 
 use flyrig_types::{Camera, Intrinsics, Isometry};
 use glam::{DVec3, Vec3};
