@@ -11,9 +11,10 @@ check_only=false
 wanted=(
   "build-essential:C and C++ compilers and make, for crates that build native code"
   "pkg-config:finds installed libraries for the build"
-  "clang:the opencv and v4l crates read the headers of OpenCV and of the kernel with it"
+  "clang:the v4l crate reads the headers of the kernel with it"
   "libclang-dev:the same"
-  "libopencv-dev:image files and image processing"
+  "cmake:builds libjpeg-turbo, which compresses images"
+  "nasm:the same"
   "libavformat-dev:video files"
   "libswscale-dev:the same"
   "libvulkan1:the Vulkan loader, to reach the graphics adapter"
@@ -55,7 +56,7 @@ if [ ${#missing[@]} -gt 0 ]; then
     command -v sudo >/dev/null || { say "not root and no sudo: run 'apt-get install ${missing[*]}' as root, then try again"; exit 1; }
     as_root=(sudo)
   fi
-  say "installing with apt-get: ${missing[*]} (OpenCV alone is about 190 MB to download)"
+  say "installing with apt-get: ${missing[*]}"
   "${as_root[@]}" apt-get update -qq
   "${as_root[@]}" env DEBIAN_FRONTEND=noninteractive apt-get install -y -qq --no-install-recommends "${missing[@]}" >/dev/null
   say "installed"

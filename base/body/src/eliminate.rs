@@ -1,12 +1,10 @@
 //! Even spacing by removal of points: weighted sample elimination (C. Yuksel, "Sample Elimination for
 //! Generating Poisson Disk Sample Sets", Computer Graphics Forum 34(2), 2015).
 
-use std::collections::BinaryHeap;
-use std::collections::binary_heap::PeekMut;
-
 use glam::Vec3;
 use rayon::prelude::*;
 
+use crate::monotone_queue::MonotoneQueue;
 use crate::point_grid::PointGrid;
 
 /// Parameters of the paper's weight function (1 - d / 2 r_max)^ALPHA, with distances below
@@ -30,26 +28,26 @@ pub(crate) fn eliminate(points: Vec<Vec3>, normals: Vec<Vec3>, keep: usize, area
     let weight = |distance: f32| (1.0 - distance.max(2.0 * r_min) / (2.0 * r_max)).max(0.0).powi(ALPHA);
 
     // By place in the grid, so that neighbours lie beside each other in memory.
-    let order = PointGrid::new(&points, 2.0 * r_max).order();
+    let grid = PointGrid::new(&points, 2.0 * r_max);
+    let order = grid.order();
     let in_order = |given: Vec<Vec3>| -> Vec<Vec3> { order.iter().map(|&index| given[index as usize]).collect() };
     let (placed, normals) = (in_order(points), in_order(normals));
-    let grid = PointGrid::new(&placed, 2.0 * r_max);
     let starts: Vec<usize> = (0..placed.len()).step_by(POINTS_A_TASK).collect();
     let neighbors: Vec<Neighbors> = starts
         .into_par_iter()
         .map(|start| {
             let mut found = Neighbors::default();
-            for i in start..(start + POINTS_A_TASK).min(placed.len()) {
+            grid.near_each(start..start + POINTS_A_TASK, 2.0 * r_max, |i, near| {
                 let mut sum = 0.0;
-                grid.within(placed[i], 2.0 * r_max, |j, squared| {
-                    if j != i && normals[i].dot(normals[j]) > 0.0 {
-                        found.list.push(j as u32);
+                for &(j, squared) in near {
+                    if j as usize != i && normals[i].dot(normals[j as usize]) > 0.0 {
+                        found.list.push(j);
                         sum += weight(squared.sqrt());
                     }
-                });
+                }
                 found.ends.push(found.list.len());
                 found.weights.push(sum);
-            }
+            });
             found.list.shrink_to_fit();
             found
         })
@@ -59,21 +57,20 @@ pub(crate) fn eliminate(points: Vec<Vec3>, normals: Vec<Vec3>, keep: usize, area
     let mut weights: Vec<f32> = neighbors.iter().flat_map(|found| &found.weights).copied().collect();
     let mut places = vec![0u32; count];
     order.iter().enumerate().for_each(|(place, &index)| places[index as usize] = place as u32);
-    let mut heap: BinaryHeap<u64> =
-        places.iter().enumerate().map(|(index, &place)| entry(weights[place as usize], index)).collect();
+    let mut heaviest = MonotoneQueue::new(|entry: &u64| (entry >> BITS_IN_A_BUCKET) as usize);
+    places.iter().enumerate().for_each(|(index, &place)| heaviest.push(entry(weights[place as usize], index)));
     let mut alive = vec![true; count];
     let mut left = count;
     while left > keep {
-        let Some(mut highest) = heap.peek_mut() else { break };
-        let index = (u32::MAX - *highest as u32) as usize;
+        let Some(first) = heaviest.pop() else { break };
+        let index = first as u32 as usize;
         let place = places[index] as usize;
-        // Weights only fall: an outdated entry is too high and sinks to its place.
+        // Weights only fall: an outdated entry is too heavy and goes to its place.
         let now = entry(weights[place], index);
-        if *highest > now {
-            *highest = now;
+        if now > first {
+            heaviest.push(now);
             continue;
         }
-        PeekMut::pop(highest);
         alive[index] = false;
         left -= 1;
         for &neighbor in of_point(place) {
@@ -83,6 +80,9 @@ pub(crate) fn eliminate(points: Vec<Vec3>, normals: Vec<Vec3>, keep: usize, area
     }
     (0..count).filter(|&i| alive[i]).collect()
 }
+
+/// Lowest bits of an entry that may differ within a bucket: steps of less than a hundredth of the weight.
+const BITS_IN_A_BUCKET: u32 = 48;
 
 /// Points whose neighbours one parallel task finds, in one list: a list for each point would fragment the memory.
 const POINTS_A_TASK: usize = 4096;
@@ -105,12 +105,12 @@ impl Neighbors {
     }
 }
 
-/// Returns a point's entry in the heap, which orders by weight, then puts the lower index first. A single number is compared
-/// and moved in a fraction of the time that a pair takes.
+/// Returns a point's entry in the queue: heavier ones are lower, then those of lower index. A single number is compared and
+/// moved in a fraction of the time that a pair takes.
 fn entry(weight: f32, index: usize) -> u64 {
     let bits = weight.to_bits();
     let ordered = if bits >> 31 == 0 { bits | 1 << 31 } else { !bits };
-    u64::from(ordered) << 32 | u64::from(u32::MAX - index as u32)
+    u64::from(!ordered) << 32 | index as u64
 }
 
 #[cfg(test)]
@@ -123,8 +123,8 @@ mod tests {
     fn the_heaviest_point_comes_first_then_the_lowest_index() {
         let weights = [-2.0f32, -1e-9, -0.0, 0.0, 1e-9, 0.5, 3.0];
         for (a, b) in weights.into_iter().flat_map(|a| weights.map(|b| (a, b))) {
-            assert_eq!(entry(a, 7).cmp(&entry(b, 7)), a.total_cmp(&b), "{a} {b}");
-            assert!(entry(a, 3) > entry(a, 4) && entry(a, 0) as u32 == u32::MAX);
+            assert_eq!(entry(a, 7).cmp(&entry(b, 7)), b.total_cmp(&a), "{a} {b}");
+            assert!(entry(a, 3) < entry(a, 4) && entry(a, 5) as u32 == 5);
         }
     }
 

@@ -7,6 +7,7 @@ use std::collections::binary_heap::PeekMut;
 use flyrig_model::stretch::growth;
 use glam::{DVec3, Vec3};
 
+use crate::monotone_queue::MonotoneQueue;
 use crate::surface_links::SurfaceLinks;
 use crate::{BodyError, SurfaceGaussians, Template};
 
@@ -117,6 +118,9 @@ pub fn displacement(rest: &[Vec3], translations: &[DVec3], nodes: [u32; 4], weig
 /// node.
 const LEAST_WEIGHT: f32 = 0.5 / 255.0;
 
+/// Distances along the surface that wait for a search in one bucket, metres.
+const BUCKET_M: f32 = 5e-4;
+
 /// Marker of a missing node.
 const NONE: u32 = u32::MAX;
 
@@ -143,13 +147,11 @@ fn hang(point: Vec3, nearest: &[u32; NEAREST + 1], nodes: &[Vec3], sigma2_m2: f6
 struct Reached {
     distance: f32,
     gaussian: u32,
-    node: u32,
 }
 
 impl Ord for Reached {
     fn cmp(&self, other: &Self) -> Ordering {
-        let key = |r: &Self| (r.gaussian, r.node);
-        other.distance.total_cmp(&self.distance).then_with(|| key(other).cmp(&key(self)))
+        other.distance.total_cmp(&self.distance).then_with(|| other.gaussian.cmp(&self.gaussian))
     }
 }
 
@@ -186,8 +188,8 @@ fn farthest_points(links: &SurfaceLinks, count: usize, nodes: usize) -> Vec<u32>
         PeekMut::pop(first);
         chosen.push(gaussian);
         distance[gaussian as usize] = 0.0;
-        front.push(Reached { distance: 0.0, gaussian, node: 0 });
-        while let Some(Reached { distance: so_far, gaussian, .. }) = front.pop() {
+        front.push(Reached { distance: 0.0, gaussian });
+        while let Some(Reached { distance: so_far, gaussian }) = front.pop() {
             if so_far > distance[gaussian as usize] {
                 continue;
             }
@@ -195,7 +197,7 @@ fn farthest_points(links: &SurfaceLinks, count: usize, nodes: usize) -> Vec<u32>
                 let new = so_far + step;
                 if new < distance[next as usize] {
                     distance[next as usize] = new;
-                    front.push(Reached { distance: new, gaussian: next, node: 0 });
+                    front.push(Reached { distance: new, gaussian: next });
                 }
             }
         }
@@ -225,19 +227,23 @@ impl Ord for Far {
 fn nearest_nodes(links: &SurfaceLinks, count: usize, node_gaussian: &[u32]) -> Vec<[u32; NEAREST + 1]> {
     // The shortest paths found so far, nearest first: they only become shorter, so a path longer than all five leads nowhere.
     let mut nearest = vec![[(f32::INFINITY, NONE); NEAREST + 1]; count];
-    let mut front: BinaryHeap<Reached> = BinaryHeap::new();
+    let mut front =
+        MonotoneQueue::new(|(distance, ..): &(u32, u32, u32)| (f32::from_bits(*distance) / BUCKET_M) as usize);
+    // Bits of distances have the order of the distances, which are not negative.
+    let reached = |distance: f32, gaussian: u32, node: u32| (distance.to_bits(), gaussian, node);
     for (&gaussian, node) in node_gaussian.iter().zip(0..) {
         if shorten(&mut nearest[gaussian as usize], 0.0, node) {
-            front.push(Reached { distance: 0.0, gaussian, node });
+            front.push(reached(0.0, gaussian, node));
         }
     }
-    while let Some(Reached { distance, gaussian, node }) = front.pop() {
+    while let Some((distance, gaussian, node)) = front.pop() {
+        let distance = f32::from_bits(distance);
         if !nearest[gaussian as usize].contains(&(distance, node)) {
             continue;
         }
         for &(next, step) in links.of(gaussian as usize) {
             if shorten(&mut nearest[next as usize], distance + step, node) {
-                front.push(Reached { distance: distance + step, gaussian: next, node });
+                front.push(reached(distance + step, next, node));
             }
         }
     }

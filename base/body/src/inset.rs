@@ -9,6 +9,8 @@ use crate::point_grid::PointGrid;
 const DRAWN_BEYOND: f32 = 1.7;
 /// Largest thickness that is measured, metres.
 const THICKEST_M: f32 = 0.05;
+/// Largest part of half the thickness by which a Gaussian moves.
+const OF_HALF: f32 = 0.9;
 /// Smallest remaining fraction of a Gaussian's scale; smaller ones would leave holes.
 const LEAST_SCALE: f32 = 0.6;
 
@@ -22,7 +24,9 @@ impl SurfaceGaussians {
         let half_thickness = |i: usize| {
             let (point, normal) = (self.positions[i], self.normals[i]);
             let mut least = THICKEST_M;
-            grid.within(point, THICKEST_M, |j, _| {
+            // A point this deep or deeper limits nothing; one that counts lies less than half its depth aside.
+            let limiting = DRAWN_BEYOND * self.scale_m[i] / (0.5 * OF_HALF);
+            grid.within(point, THICKEST_M.min(1.12 * limiting), |j, _| {
                 // On the other side, and below this point.
                 let depth = (point - self.positions[j]).dot(normal);
                 if depth > 1e-3 && self.normals[j].dot(normal) < -0.5 {
@@ -37,7 +41,7 @@ impl SurfaceGaussians {
         let halves: Vec<f32> = (0..self.len()).into_par_iter().map(half_thickness).collect();
         for (i, half) in halves.into_iter().enumerate() {
             let wanted = DRAWN_BEYOND * self.scale_m[i];
-            let by = wanted.min(0.9 * half);
+            let by = wanted.min(OF_HALF * half);
             moved.positions[i] = self.positions[i] - self.normals[i] * by;
             moved.depth_m[i] = self.depth_m[i] + by;
             moved.scale_m[i] = self.scale_m[i] * (by / wanted.max(1e-12)).clamp(LEAST_SCALE, 1.0);
@@ -65,5 +69,27 @@ mod tests {
         }
         assert!((200..10_000).contains(&shrunk), "fingers and ears, not the trunk: {shrunk}");
         assert_eq!((inset.normals, inset.skin), (surface.normals, surface.skin));
+    }
+
+    #[test]
+    fn thickness_is_that_of_a_plain_search() {
+        let template = default_template(&ShapeParams::default()).unwrap();
+        for count in [2_000, 6_000] {
+            let surface = sample_surface(&template, count, 2).unwrap();
+            let inset = surface.inset();
+            for i in (0..count).step_by(3) {
+                let (point, normal) = (surface.positions[i], surface.normals[i]);
+                let depths = (0..count).filter_map(|j| {
+                    let away = point - surface.positions[j];
+                    let depth = away.dot(normal);
+                    let is_below = depth > 1e-3 && (away - normal * depth).length() < 0.5 * depth;
+                    let is_other_side = surface.normals[j].dot(normal) < -0.5;
+                    (is_below && is_other_side && away.length() <= 0.05).then_some(depth)
+                });
+                let expected = (1.7 * surface.scale_m[i]).min(0.45 * depths.fold(0.05, f32::min));
+                let found = inset.depth_m[i];
+                assert!((found - expected).abs() < 1e-6, "{i} of {count}: {found} {expected}");
+            }
+        }
     }
 }

@@ -46,6 +46,7 @@ mod graph;
 mod inset;
 mod joint_names;
 mod mesh_ply;
+mod monotone_queue;
 mod motion_clip;
 mod outfit;
 mod part;

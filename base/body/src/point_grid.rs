@@ -1,5 +1,7 @@
 //! Grid of points for neighbour queries.
 
+use std::ops::Range;
+
 use glam::{IVec3, Vec3};
 
 /// Largest number of cells; more would cost more memory than they save time.
@@ -92,17 +94,84 @@ impl PointGrid {
         });
     }
 
+    /// Calls `visit(place, near)` for the points at these places of [`Self::order`], in turn. `near` holds place and squared distance of
+    /// each point within `radius`, itself included, in the order of [`Self::within`]. What is near a block of cells is gathered
+    /// once for all its points: a third of the time that a query for each takes.
+    pub(crate) fn near_each(&self, places: Range<usize>, radius: f32, mut visit: impl FnMut(usize, &[(u32, f32)])) {
+        let mut gathered = Gathered::default();
+        let mut near = Vec::new();
+        let mut first = places.start;
+        while first < places.end.min(self.sorted.len()) {
+            let block = self.block(self.cell_of(self.sorted[first].1));
+            let last = (self.starts[block + 1] as usize).min(places.end);
+            let points = &self.sorted[first..last];
+            let low = points.iter().map(|(_, point)| *point).fold(Vec3::INFINITY, Vec3::min) - radius;
+            let high = points.iter().map(|(_, point)| *point).fold(Vec3::NEG_INFINITY, Vec3::max) + radius;
+            gathered.clear();
+            self.for_each_row(low, high, |row| {
+                for (place, (_, point)) in row.clone().zip(&self.sorted[row]) {
+                    if (low.x..=high.x).contains(&point.x) {
+                        gathered.push(place as u32, *point);
+                    }
+                }
+            });
+            for (place, (_, centre)) in (first..last).zip(points) {
+                near.clear();
+                let squared = gathered.squared_distances(*centre);
+                near.extend(squared.filter(|(_, squared)| *squared <= radius * radius));
+                visit(place, &near);
+            }
+            first = last;
+        }
+    }
+
     /// Calls `visit(index, position)` for each point of a box and for some beside it, in a fixed order.
     pub fn near_box(&self, low: Vec3, high: Vec3, mut visit: impl FnMut(usize, Vec3)) {
+        self.for_each_row(low, high, |row| {
+            self.sorted[row].iter().for_each(|(index, point)| visit(*index as usize, *point));
+        });
+    }
+
+    /// Calls `visit` with the places of the points of each row of blocks that a box touches, in a fixed order.
+    fn for_each_row(&self, low: Vec3, high: Vec3, mut visit: impl FnMut(Range<usize>)) {
         let (low, high) = (self.cell_of(low), self.cell_of(high));
         for z in low.z..=high.z {
             for y in low.y..=high.y {
                 // Blocks of a row lie side by side.
-                let first = self.starts[self.block(IVec3::new(low.x, y, z))] as usize;
-                let last = self.starts[self.block(IVec3::new(high.x, y, z)) + 1] as usize;
-                self.sorted[first..last].iter().for_each(|(index, point)| visit(*index as usize, *point));
+                let first = self.starts[self.block(IVec3::new(low.x, y, z))];
+                let last = self.starts[self.block(IVec3::new(high.x, y, z)) + 1];
+                visit(first as usize..last as usize);
             }
         }
+    }
+}
+
+/// Points by axis, so that distances are computed side by side.
+#[derive(Default)]
+struct Gathered {
+    places: Vec<u32>,
+    axes: [Vec<f32>; 3],
+    squared: Vec<f32>,
+}
+
+impl Gathered {
+    fn clear(&mut self) {
+        self.places.clear();
+        self.axes.iter_mut().for_each(Vec::clear);
+    }
+
+    fn push(&mut self, place: u32, point: Vec3) {
+        self.places.push(place);
+        self.axes.iter_mut().zip(point.to_array()).for_each(|(axis, value)| axis.push(value));
+    }
+
+    /// Returns place and squared distance of each point.
+    fn squared_distances(&mut self, centre: Vec3) -> impl Iterator<Item = (u32, f32)> {
+        let [xs, ys, zs] = &self.axes;
+        self.squared.clear();
+        let squared = xs.iter().zip(ys).zip(zs).map(|((x, y), z)| Vec3::new(*x, *y, *z).distance_squared(centre));
+        self.squared.extend(squared);
+        self.places.iter().copied().zip(self.squared.iter().copied())
     }
 }
 
@@ -126,6 +195,29 @@ mod tests {
             }
         }
         PointGrid::new(&[], 1.0).within(Vec3::ZERO, 1.0, |_, _| panic!("no points"));
+    }
+
+    #[test]
+    fn what_is_near_each_point_is_what_a_query_for_it_finds_in_the_same_order() {
+        let mut rng = rand::rngs::StdRng::seed_from_u64(8);
+        let points: Vec<Vec3> = (0..3000).map(|_| Vec3::from_array(rng.random::<[f32; 3]>()) * 2.0 - 1.0).collect();
+        for (cell, radius) in [(0.1, 0.1), (0.03, 0.12), (5.0, 0.2)] {
+            let grid = PointGrid::new(&points, cell);
+            let order = grid.order();
+            let mut visited = 0;
+            for places in [0..1, 1..1700, 1700..9000] {
+                grid.near_each(places, radius, |place, near| {
+                    assert_eq!(place, visited);
+                    visited += 1;
+                    let mut expected = Vec::new();
+                    grid.within(points[order[place] as usize], radius, |j, squared| expected.push((j as u32, squared)));
+                    let near: Vec<(u32, f32)> = near.iter().map(|&(j, squared)| (order[j as usize], squared)).collect();
+                    assert_eq!(near, expected, "cell {cell} radius {radius}");
+                });
+            }
+            assert_eq!(visited, points.len());
+        }
+        PointGrid::new(&[], 1.0).near_each(0..5, 1.0, |_, _| panic!("no points"));
     }
 
     #[test]

@@ -1,11 +1,7 @@
 //! JPEG compression of uncompressed images, for the network and the disk.
 
 use flyrig_types::{Frame, Image, PixelFormat};
-use opencv::{
-    core::{Mat, MatTraitConst as _, Vector, VectorToVec as _},
-    imgcodecs::{IMWRITE_JPEG_QUALITY, imencode},
-    imgproc::{COLOR_RGB2BGR, cvt_color_def},
-};
+use turbojpeg::{Compressor, Subsamp};
 
 use crate::error::{CaptureError, CaptureErrorKind};
 use crate::mjpeg::JpegScratch;
@@ -16,9 +12,9 @@ use crate::stage::FrameStage;
 #[derive(Debug)]
 pub struct JpegEncoding {
     quality: i32,
+    /// Made with the first image, where making it can fail.
+    compressor: Option<Compressor>,
     rgb: Vec<u8>,
-    bgr: Mat,
-    jpeg: Vector<u8>,
     scratch: JpegScratch,
 }
 
@@ -27,26 +23,40 @@ impl JpegEncoding {
     #[must_use]
     pub fn new(quality: u8) -> Self {
         let quality = i32::from(quality.clamp(1, 100));
-        Self { quality, rgb: Vec::new(), bgr: Mat::default(), jpeg: Vector::new(), scratch: JpegScratch::default() }
+        Self { quality, compressor: None, rgb: Vec::new(), scratch: JpegScratch::default() }
     }
 
-    /// Compresses an image.
+    /// Compresses an image, with half as many samples of colour in each direction as of brightness (4:2:0).
     ///
     /// # Errors
     /// `Unsupported` and `Corrupt` for images that cannot be converted to RGB first.
     pub fn encode(&mut self, image: &Image) -> Result<Image, CaptureError> {
         let corrupt = |text: String| CaptureError::general(CaptureErrorKind::Corrupt, text);
         rgb::convert(image, &mut self.rgb, &mut self.scratch)?;
-        let jpeg = self.jpeg(image.height()).map_err(|error| corrupt(format!("cannot be compressed: {error}")))?;
-        Image::new(image.width(), image.height(), PixelFormat::Mjpeg, jpeg).map_err(|error| corrupt(error.to_string()))
+        let (width, height) = (image.width(), image.height());
+        let jpeg = self
+            .jpeg(width as usize, height as usize)
+            .map_err(|error| corrupt(format!("cannot be compressed: {error}")))?;
+        Image::new(width, height, PixelFormat::Mjpeg, jpeg).map_err(|error| corrupt(error.to_string()))
     }
 
-    fn jpeg(&mut self, height: u32) -> opencv::Result<Vec<u8>> {
-        let flat = Mat::from_slice(&self.rgb)?;
-        cvt_color_def(&flat.reshape(3, height as i32)?, &mut self.bgr, COLOR_RGB2BGR)?;
-        let quality = Vector::from_slice(&[IMWRITE_JPEG_QUALITY, self.quality]);
-        imencode(".jpg", &self.bgr, &mut self.jpeg, &quality)?;
-        Ok(self.jpeg.to_vec())
+    fn jpeg(&mut self, width: usize, height: usize) -> turbojpeg::Result<Vec<u8>> {
+        let compressor = match &mut self.compressor {
+            Some(compressor) => compressor,
+            none => {
+                let mut compressor = Compressor::new()?;
+                compressor.set_quality(self.quality)?;
+                compressor.set_subsamp(Subsamp::Sub2x2)?;
+                none.insert(compressor)
+            }
+        };
+        compressor.compress_to_vec(turbojpeg::Image {
+            pixels: &self.rgb,
+            width,
+            pitch: 3 * width,
+            height,
+            format: turbojpeg::PixelFormat::RGB,
+        })
     }
 }
 

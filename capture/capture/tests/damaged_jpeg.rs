@@ -13,10 +13,7 @@ use ac_ffmpeg::{
 };
 use flyrig_capture::{Decoding, FrameStage as _};
 use flyrig_types::{Frame, Image, PixelFormat};
-use opencv::{
-    core::{Mat, MatTraitConst as _, Vector, VectorToVec as _},
-    imgcodecs::{IMWRITE_JPEG_QUALITY, IMWRITE_JPEG_RST_INTERVAL, imencode},
-};
+use jpeg_encoder::{ColorType, SamplingFactor};
 use zune_jpeg::{
     JpegDecoder,
     zune_core::{bytestream::ZCursor, colorspace::ColorSpace, options::DecoderOptions},
@@ -161,8 +158,8 @@ impl Scene {
 
 /// Encoder of a camera.
 enum Encoder {
-    /// libjpeg: 4:2:0; quality, MCUs between two restart markers.
-    Libjpeg(i32, i32),
+    /// 4:2:0 as libjpeg writes it; quality, MCUs between two restart markers.
+    Subsampled(u8, u16),
     /// 4:4:4 with the standard's Huffman tables; quality.
     Plain(u8),
     /// FFmpeg with 4:2:2 and the standard's Huffman tables, as most USB cameras.
@@ -185,14 +182,13 @@ impl Encoder {
 
     fn encode(&mut self, rgb: &[u8], [width, height]: [usize; 2]) -> Vec<u8> {
         match self {
-            Self::Libjpeg(quality, interval) => {
-                let bgr: Vec<u8> = rgb.chunks_exact(3).flat_map(|p| [p[2], p[1], p[0]]).collect();
-                let flat = Mat::from_slice(&bgr).unwrap();
-                let mut bytes = Vector::new();
-                let options = [IMWRITE_JPEG_QUALITY, *quality, IMWRITE_JPEG_RST_INTERVAL, *interval];
-                imencode(".jpg", &flat.reshape(3, height as i32).unwrap(), &mut bytes, &Vector::from_slice(&options))
-                    .unwrap();
-                bytes.to_vec()
+            Self::Subsampled(quality, interval) => {
+                let mut bytes = Vec::new();
+                let mut encoder = jpeg_encoder::Encoder::new(&mut bytes, *quality);
+                encoder.set_sampling_factor(SamplingFactor::R_4_2_0);
+                encoder.set_restart_interval(*interval);
+                encoder.encode(rgb, width as u16, height as u16, ColorType::Rgb).unwrap();
+                bytes
             }
             Self::Plain(quality) => {
                 let mut bytes = Vec::new();
@@ -315,22 +311,22 @@ struct Counts {
 /// Sends images of several cameras through decoding, one damaged one after each good one.
 fn run(size: [usize; 2], images: usize) -> Counts {
     let kinds = [Kind::Room, Kind::Room, Kind::Room, Kind::Dark, Kind::Gradient, Kind::Room, Kind::Room, Kind::Noise];
-    let across = size[0].div_ceil(16) as i32;
+    let across = size[0].div_ceil(16) as u16;
     let mut counts = Counts::default();
     let mut random = Random(11);
     for (camera, kind) in kinds.into_iter().enumerate() {
         let mut scene = Scene::new(kind, size, camera as u64);
         let mut encoder = match camera {
-            0 => Encoder::Libjpeg(50, 0),
-            1 => Encoder::Libjpeg(85, 0),
-            2 => Encoder::Libjpeg(80, across),
+            0 => Encoder::Subsampled(50, 0),
+            1 => Encoder::Subsampled(85, 0),
+            2 => Encoder::Subsampled(80, across),
             3 | 6 => Encoder::Plain(80),
             5 => Encoder::usb(size, 9),
             _ => Encoder::usb(size, 4),
         };
         let mut decoding = Decoding::new(Some(size.map(|side| side as u32)));
         // A USB camera leaves out its tables; the other encoders make their own for each image.
-        let is_bare = !matches!(encoder, Encoder::Libjpeg(..));
+        let is_bare = !matches!(encoder, Encoder::Subsampled(..));
         let mut shoot = || {
             let whole = encoder.encode(&scene.next(), size);
             if is_bare { without_tables(&whole) } else { (whole, Vec::new()) }

@@ -2,25 +2,29 @@
 
 #![allow(clippy::unwrap_used, clippy::panic, reason = "helpers of tests")]
 
+mod film;
+
 use std::{fs, path::Path, time::Duration};
 
+use ac_ffmpeg::time::TimeBase;
 use flyrig_capture::{CameraSource, CaptureError, CaptureErrorKind, VideoOptions, VideoReplay};
 use flyrig_types::{Frame, PixelFormat};
-use opencv::{
-    core::{CV_8UC3, Mat, Scalar, Size},
-    videoio::{VideoWriter, VideoWriterTrait},
-};
 
-/// Writes a video of `count` uniform frames at 25 per second whose red grows by 20 per frame.
-fn write(path: &Path, codec: [char; 4], count: u32) {
-    let [a, b, c, d] = codec;
-    let code = VideoWriter::fourcc(a, b, c, d).unwrap();
-    let mut writer = VideoWriter::new_def(path.to_str().unwrap(), code, 25.0, Size::new(64, 48)).unwrap();
-    for i in 0..count {
-        let color = Scalar::new(10.0, 100.0, f64::from(20 * i), 0.0);
-        writer.write(&Mat::new_rows_cols_with_default(48, 64, CV_8UC3, color).unwrap()).unwrap();
-    }
-    writer.release().unwrap();
+use film::Film;
+
+/// Writes a video of `count` frames at 25 per second whose red grows by 20 per frame.
+fn write(path: &Path, (container, codec): (&str, &str), count: i64) {
+    let film = Film {
+        container,
+        codec,
+        time_base: TimeBase::new(1, 25),
+        color: |i| [20 * i, 100, 10],
+        reordered: 0,
+        times: (0..count).map(|i| 40 * i).collect(),
+        sound: 0,
+        muxing: &[],
+    };
+    film.write(path);
 }
 
 fn all(source: &mut VideoReplay) -> Vec<Result<Frame, CaptureError>> {
@@ -40,7 +44,7 @@ fn open(path: &Path, options: &VideoOptions) -> VideoReplay {
 #[test]
 fn every_frame_comes_with_its_number_and_time() {
     let dir = tempfile::tempdir().unwrap();
-    for (name, codec) in [("v.mp4", ['m', 'p', '4', 'v']), ("v.avi", ['M', 'J', 'P', 'G'])] {
+    for (name, codec) in [("v.mp4", ("mp4", "mpeg4")), ("v.avi", ("avi", "mjpeg"))] {
         let path = dir.path().join(name);
         write(&path, codec, 10);
         let mut source = open(&path, &VideoOptions::default());
@@ -61,7 +65,7 @@ fn every_frame_comes_with_its_number_and_time() {
 fn range_rate_and_offset_are_kept() {
     let dir = tempfile::tempdir().unwrap();
     let path = dir.path().join("v.avi");
-    write(&path, ['M', 'J', 'P', 'G'], 10);
+    write(&path, ("avi", "mjpeg"), 10);
     let options = VideoOptions { fps: Some(50.0), frames: Some(3..5), offset_nanos: -7 };
     let times: Vec<(u64, i64)> = all(&mut open(&path, &options))
         .into_iter()
@@ -76,7 +80,7 @@ fn range_rate_and_offset_are_kept() {
 fn a_dropped_frame_gives_its_buffer_to_a_later_one() {
     let dir = tempfile::tempdir().unwrap();
     let path = dir.path().join("v.avi");
-    write(&path, ['M', 'J', 'P', 'G'], 3);
+    write(&path, ("avi", "mjpeg"), 3);
     let mut source = open(&path, &VideoOptions::default());
     let address = |frame: &Frame| frame.image.bytes().as_ptr();
     let first = source.next_frame(Duration::ZERO).unwrap();
@@ -89,7 +93,7 @@ fn a_dropped_frame_gives_its_buffer_to_a_later_one() {
 fn cut_files_are_refused_or_end_with_a_word() {
     let dir = tempfile::tempdir().unwrap();
     let path = dir.path().join("v.mp4");
-    write(&path, ['m', 'p', '4', 'v'], 10);
+    write(&path, ("mp4", "mpeg4"), 10);
     let whole = fs::read(&path).unwrap();
     fs::write(&path, &whole[..whole.len() / 2]).unwrap();
     let error = VideoReplay::open(&"a".into(), &path, &VideoOptions::default()).unwrap_err();
@@ -97,7 +101,7 @@ fn cut_files_are_refused_or_end_with_a_word() {
     assert!(error.to_string().contains("v.mp4: cannot be opened as a video; it may be cut off"), "{error}");
 
     let path = dir.path().join("v.avi");
-    write(&path, ['M', 'J', 'P', 'G'], 10);
+    write(&path, ("avi", "mjpeg"), 10);
     let whole = fs::read(&path).unwrap();
     fs::write(&path, &whole[..whole.len() * 4 / 5]).unwrap();
     let results = all(&mut open(&path, &VideoOptions::default()));
@@ -107,7 +111,7 @@ fn cut_files_are_refused_or_end_with_a_word() {
     assert!(error.to_string().contains("bytes are missing); the file is cut off or damaged"), "{error}");
     assert!((1..9).contains(&before.len()) && before.iter().all(Result::is_ok), "{}", before.len());
 
-    write(&path, ['M', 'J', 'P', 'G'], 0);
+    write(&path, ("avi", "mjpeg"), 0);
     let none = VideoReplay::open(&"a".into(), &path, &VideoOptions::default());
     let error = none.map(|mut source| all(&mut source).remove(0).unwrap_err()).unwrap_or_else(|error| error);
     assert_eq!(error.kind, CaptureErrorKind::Corrupt);

@@ -2,101 +2,17 @@
 
 #![allow(clippy::unwrap_used, clippy::panic, reason = "helpers of tests")]
 
-use std::{fs, fs::File, path::Path, time::Duration};
+mod film;
 
-use ac_ffmpeg::{
-    codec::{
-        AudioCodecParameters, CodecParameters, Encoder as _,
-        audio::ChannelLayout,
-        video::{PixelFormat as FramePixels, VideoEncoder, VideoFrameMut},
-    },
-    format::{
-        io::IO,
-        muxer::{Muxer, OutputFormat},
-    },
-    packet::PacketMut,
-    time::{TimeBase, Timestamp},
-};
+use std::{fs, path::Path, time::Duration};
+
 use flyrig_capture::{CameraSource, CaptureErrorKind, VideoOptions, VideoReplay};
 
-/// Time base of the films: 1 ms.
-fn millis() -> TimeBase {
-    TimeBase::new(1, 1000)
-}
+use film::{Film, millis};
 
-/// Film of 64x48 pixels whose frame `i` has the luma `60 + 3 i` in its left half.
-struct Film<'a> {
-    container: &'a str,
-    codec: &'a str,
-    /// Largest number of consecutive frames that are stored after a later one.
-    reordered: u32,
-    /// Presentation times, milliseconds.
-    times: Vec<i64>,
-    /// Length of the sound track, milliseconds; none for 0.
-    sound: i64,
-    muxing: &'a [(&'a str, &'a str)],
-}
-
-impl Film<'_> {
-    fn write(&self, path: &Path) {
-        let format: FramePixels = if self.codec == "mjpeg" { "yuvj420p" } else { "yuv420p" }.parse().unwrap();
-        let mut encoder = VideoEncoder::builder(self.codec)
-            .unwrap()
-            .pixel_format(format)
-            .width(64)
-            .height(48)
-            .time_base(millis())
-            .set_option("flags", if self.container == "mpegts" { "+qscale" } else { "+qscale+global_header" })
-            .set_option("global_quality", 236)
-            .set_option("bf", self.reordered)
-            .build()
-            .unwrap();
-        let mut builder = Muxer::builder().interleaved(true);
-        builder.add_stream(&CodecParameters::from(encoder.codec_parameters())).unwrap();
-        builder.streams_mut()[0].set_time_base(millis());
-        if self.sound > 0 {
-            let sound = AudioCodecParameters::builder("pcm_s16le")
-                .unwrap()
-                .sample_rate(8000)
-                .sample_format("s16".parse().unwrap())
-                .channel_layout(&ChannelLayout::from_channels(1).unwrap())
-                .build();
-            builder.add_stream(&CodecParameters::from(sound)).unwrap();
-        }
-        // To move the index to the front, FFmpeg opens the file again.
-        builder = builder.set_option("url", path.to_str().unwrap());
-        for (key, value) in self.muxing {
-            builder = builder.set_option(key, value);
-        }
-        let file = IO::from_seekable_write_stream(File::create(path).unwrap());
-        let mut muxer = builder.build(file, OutputFormat::find_by_name(self.container).unwrap()).unwrap();
-        let mut pass_on = |encoder: &mut VideoEncoder| {
-            while let Some(packet) = encoder.take().unwrap() {
-                // The last frame has no duration otherwise, and no player shows it.
-                let packet = packet.into_mut().with_duration(Duration::from_millis(40)).freeze();
-                muxer.push(packet.with_stream_index(0)).unwrap();
-            }
-        };
-        for (i, time) in self.times.iter().enumerate() {
-            let mut frame = VideoFrameMut::black(format, 64, 48);
-            for row in frame.planes_mut()[0].lines_mut() {
-                row[..32].fill(60 + 3 * i as u8);
-            }
-            let frame = frame.with_time_base(millis()).with_pts(Timestamp::from_millis(*time));
-            encoder.push(frame.freeze()).unwrap();
-            pass_on(&mut encoder);
-        }
-        encoder.flush().unwrap();
-        pass_on(&mut encoder);
-        for second in 0..self.sound / 1000 {
-            let packet =
-                PacketMut::new(16_000).with_time_base(millis()).with_pts(Timestamp::from_millis(1000 * second));
-            muxer.push(packet.with_dts(Timestamp::from_millis(1000 * second)).with_stream_index(1).freeze()).unwrap();
-        }
-        muxer.flush().unwrap();
-        // Some writers return their number of bytes, which the wrapper takes for an error.
-        let _ = muxer.close();
-    }
+/// Returns the colour of frame `i` of the films.
+fn ever_brighter(i: u8) -> [u8; 3] {
+    [60 + 3 * i; 3]
 }
 
 /// Reads a video: times in milliseconds, luma on the left, and the texts of errors.
@@ -145,7 +61,17 @@ fn every_frame_has_its_own_time_in_every_container() {
         for (rate, times) in [("constant", constant.clone()), ("variable", variable())] {
             let name = format!("{container} {codec} {reordered} {rate}");
             let path = dir.path().join("film");
-            Film { container, codec, reordered, times: times.clone(), sound: 0, muxing: &[] }.write(&path);
+            Film {
+                container,
+                codec,
+                time_base: millis(),
+                color: ever_brighter,
+                reordered,
+                times: times.clone(),
+                sound: 0,
+                muxing: &[],
+            }
+            .write(&path);
             assert_times(&name, &path, &times);
         }
     }
@@ -156,16 +82,44 @@ fn a_header_that_promises_more_is_no_damage() {
     let dir = tempfile::tempdir().unwrap();
     let path = dir.path().join("film");
     // OpenCV and others multiply the length of the whole file by the frame rate.
-    Film { container: "matroska", codec: "mpeg4", reordered: 2, times: variable(), sound: 6000, muxing: &[] }
-        .write(&path);
+    Film {
+        container: "matroska",
+        codec: "mpeg4",
+        time_base: millis(),
+        color: ever_brighter,
+        reordered: 2,
+        times: variable(),
+        sound: 6000,
+        muxing: &[],
+    }
+    .write(&path);
     assert_times("longer sound", &path, &variable());
     // A pipe: the length is unknown.
     let live = [("live", "1")];
-    Film { container: "matroska", codec: "mpeg4", reordered: 0, times: variable(), sound: 0, muxing: &live }
-        .write(&path);
+    Film {
+        container: "matroska",
+        codec: "mpeg4",
+        time_base: millis(),
+        color: ever_brighter,
+        reordered: 0,
+        times: variable(),
+        sound: 0,
+        muxing: &live,
+    }
+    .write(&path);
     assert_times("live", &path, &variable());
     let times: Vec<i64> = (0..40).map(|i| 40 * i).collect();
-    Film { container: "avi", codec: "mjpeg", reordered: 0, times: times.clone(), sound: 0, muxing: &[] }.write(&path);
+    Film {
+        container: "avi",
+        codec: "mjpeg",
+        time_base: millis(),
+        color: ever_brighter,
+        reordered: 0,
+        times: times.clone(),
+        sound: 0,
+        muxing: &[],
+    }
+    .write(&path);
     let mut bytes = fs::read(&path).unwrap();
     for (chunk, offset) in [(b"avih", 8 + 16), (b"strh", 8 + 32)] {
         let at = bytes.windows(4).position(|window| window == chunk).unwrap() + offset;
@@ -182,7 +136,17 @@ fn frames_before_the_start_of_an_edit_are_not_shown() {
     let times: Vec<i64> = (-8..32).map(|i| 40 * i).collect();
     // The writer keeps them in the file and skips them with an edit list.
     let muxing = [("avoid_negative_ts", "disabled")];
-    Film { container: "mp4", codec: "mpeg4", reordered: 2, times, sound: 0, muxing: &muxing }.write(&path);
+    Film {
+        container: "mp4",
+        codec: "mpeg4",
+        time_base: millis(),
+        color: ever_brighter,
+        reordered: 2,
+        times,
+        sound: 0,
+        muxing: &muxing,
+    }
+    .write(&path);
     assert_times("edit list", &path, &(0..32).map(|i| 40 * i).collect::<Vec<_>>());
 }
 
@@ -190,7 +154,17 @@ fn frames_before_the_start_of_an_edit_are_not_shown() {
 fn a_film_of_a_turned_camera_is_upright() {
     let dir = tempfile::tempdir().unwrap();
     let path = dir.path().join("film");
-    Film { container: "mp4", codec: "mpeg4", reordered: 0, times: vec![0, 40], sound: 0, muxing: &[] }.write(&path);
+    Film {
+        container: "mp4",
+        codec: "mpeg4",
+        time_base: millis(),
+        color: ever_brighter,
+        reordered: 0,
+        times: vec![0, 40],
+        sound: 0,
+        muxing: &[],
+    }
+    .write(&path);
     let bytes = fs::read(&path).unwrap();
     let at = bytes.windows(4).position(|window| window == b"tkhd").unwrap() + 4 + 40;
     // The bright half lies on the left of the stored image. Columns: a, b, c, d of the matrix, and where it is then.
@@ -227,7 +201,17 @@ fn a_file_that_is_cut_is_reported_once_behind_its_whole_frames() {
         ("matroska", "mpeg4", &[]),
         ("avi", "mjpeg", &[]),
     ] {
-        Film { container, codec, reordered: 0, times: variable(), sound: 0, muxing }.write(&path);
+        Film {
+            container,
+            codec,
+            time_base: millis(),
+            color: ever_brighter,
+            reordered: 0,
+            times: variable(),
+            sound: 0,
+            muxing,
+        }
+        .write(&path);
         let whole = fs::read(&path).unwrap();
         fs::write(&path, &whole[..whole.len() * 4 / 5]).unwrap();
         let (times, lumas, errors) = read(&path);

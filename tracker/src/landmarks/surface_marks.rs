@@ -183,8 +183,12 @@ impl Body<'_> {
             .find(|&j| joints[j].name.to_ascii_lowercase().contains("thumb") && self.is_below(j, hand));
         let thumb: Vec<usize> = thumb_joint.map_or(Vec::new(), |joint| self.vertices_below(joint));
         // The thumb stands off the row of fingers: without it the mean of the flesh gives the fingers' direction.
-        let points: Vec<DVec3> =
-            self.vertices_below(hand).into_iter().filter(|v| !thumb.contains(v)).map(|v| self.position(v)).collect();
+        let points: Vec<DVec3> = self
+            .vertices_below(hand)
+            .into_iter()
+            .filter(|v| thumb.binary_search(v).is_err())
+            .map(|v| self.position(v))
+            .collect();
         if points.is_empty() {
             return Err(self.missing("hand"));
         }

@@ -1,6 +1,6 @@
 //! Shape space of a body: scale, lengths, girths and targets, their prior among people, and the template of each shape.
 
-use std::collections::BTreeMap;
+use std::{borrow::Cow, collections::BTreeMap};
 
 use flyrig_body::{Joint, ShapeParams, Skeleton, Template, default_template};
 use glam::{DMat3, DMat4, DVec3};
@@ -25,6 +25,9 @@ pub(crate) const GIRTHS: [&str; 5] = ["trunk-depth", "arm-girth", "thigh-girth",
 /// Targets of the built-in body.
 const TARGETS: [&str; 6] = ["gender", "weight", "muscle", "age", "height", "proportions"];
 
+/// Place of the first target among the parameters.
+const FIRST_TARGET: usize = 1 + LENGTHS.len() + GIRTHS.len();
+
 /// Template with parameters of shape: the whole-body scale, lengths, girths, and the targets of the built-in body.
 #[derive(Debug, Clone)]
 pub(crate) struct ShapeSpace {
@@ -48,10 +51,14 @@ impl ShapeSpace {
             .collect()
     }
 
+    /// Returns whether a parameter is a target of the built-in body.
+    pub fn is_target(index: usize) -> bool {
+        index >= FIRST_TARGET
+    }
+
     /// Clamps a parameter to the range in which bodies exist.
     pub fn clamped(index: usize, value: f64) -> f64 {
-        let is_target = index > LENGTHS.len() + GIRTHS.len();
-        if is_target { value.clamp(0.0, 0.99) } else { value.clamp(0.4, 1.6) }
+        if Self::is_target(index) { value.clamp(0.0, 0.99) } else { value.clamp(0.4, 1.6) }
     }
 
     /// Returns the template of a shape.
@@ -59,18 +66,43 @@ impl ShapeSpace {
     /// # Errors
     /// Kind `Template` when no such body exists.
     pub fn template(&self, values: &[f64]) -> Result<Template, TrackError> {
-        let named: BTreeMap<&str, f64> = self.prior().iter().zip(values).map(|((name, ..), v)| (*name, *v)).collect();
-        let shaped;
+        self.unscaled(values)?.scaled(values)
+    }
+
+    /// Returns the body of a shape's targets before scale, lengths and girths.
+    ///
+    /// # Errors
+    /// Kind `Template` when no such body exists.
+    pub fn unscaled(&self, values: &[f64]) -> Result<UnscaledBody<'_>, TrackError> {
         let base = if self.has_targets {
-            let targets = TARGETS.iter().map(|name| ((*name).to_owned(), named.get(name).map_or(0.5, |v| *v as f32)));
-            shaped = default_template(&ShapeParams(targets.collect()))
+            let weights = values.iter().skip(FIRST_TARGET).map(|weight| *weight as f32);
+            let targets = TARGETS.iter().map(|name| (*name).to_owned()).zip(weights.chain(std::iter::repeat(0.5)));
+            let shaped = default_template(&ShapeParams(targets.collect()))
                 .map_err(|error| TrackError::new(TrackErrorKind::Template, format!("the built-in body: {error}")))?;
-            &shaped
+            Cow::Owned(shaped)
         } else {
-            &self.base
+            Cow::Borrowed(&self.base)
         };
-        let factors = named.into_iter().map(|(name, value)| (name.to_owned(), value)).collect();
-        scale_template(base, &BodyModel::new(base)?, &factors)
+        Ok(UnscaledBody { model: BodyModel::with_anatomical_marks(&base)?, base, space: self })
+    }
+}
+
+/// Body of a shape's targets before scale, lengths and girths.
+#[derive(Debug)]
+pub(crate) struct UnscaledBody<'a> {
+    space: &'a ShapeSpace,
+    base: Cow<'a, Template>,
+    model: BodyModel,
+}
+
+impl UnscaledBody<'_> {
+    /// Returns the template of a shape with the same targets; those in `values` are not read.
+    ///
+    /// # Errors
+    /// Kind `Template` when no such body exists.
+    pub fn scaled(&self, values: &[f64]) -> Result<Template, TrackError> {
+        let named = self.space.prior().into_iter().zip(values).map(|((name, ..), value)| (name.to_owned(), *value));
+        scale_template(&self.base, &self.model, &named.collect())
     }
 }
 

@@ -77,6 +77,7 @@ impl ShapeProblem<'_> {
 
     /// Returns the derivatives of a model by the parameters of its shape.
     fn derivatives(&self, shape: &[f64], template: &Template, model: &BodyModel) -> Option<ShapeDerivatives> {
+        let unscaled = self.space.unscaled(shape).ok()?;
         let columns: Vec<_> = (0..shape.len())
             .into_par_iter()
             .map(|k| {
@@ -84,7 +85,9 @@ impl ShapeProblem<'_> {
                 let step = if ShapeSpace::clamped(k, shape[k] + STEP) > shape[k] + 0.5 * STEP { STEP } else { -STEP };
                 let mut moved = shape.to_vec();
                 moved[k] += step;
-                let (other, other_model) = self.model(&moved)?;
+                let of_targets = ShapeSpace::is_target(k).then(|| self.space.unscaled(&moved)).transpose().ok()?;
+                let other = of_targets.as_ref().unwrap_or(&unscaled).scaled(&moved).ok()?;
+                let other_model = BodyModel::new(&other).ok()?;
                 let change = |a: DVec3, b: DVec3| (a - b) / step;
                 let pairs = |a: &[DVec3], b: &[DVec3]| a.iter().zip(b).map(|(a, b)| change(*a, *b)).collect::<Vec<_>>();
                 let local = |model: &BodyModel, i: usize| {
