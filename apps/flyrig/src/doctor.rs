@@ -31,7 +31,7 @@ pub fn doctor(config: Option<&Path>) -> Result<()> {
                 .to_owned(),
         );
     } else if adapters.iter().all(|name| name.ends_with(", software)")) {
-        mends.push("only a software graphics adapter: a rig in real time needs a GPU and its Vulkan driver".to_owned());
+        mends.push("only a software graphics adapter: flyrig computes on the processor; if there is a GPU, install its Vulkan driver".to_owned());
     }
     println!("problems");
     for mend in &mends {

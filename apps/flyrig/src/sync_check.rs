@@ -264,6 +264,7 @@ mod tests {
     }
 
     #[test]
+    #[ignore = "minutes: run by make test-long"]
     fn random_lags_of_a_person_who_jumps_are_found_by_silhouettes() {
         let gpu = GpuContext::new(&AdapterChoice::Best).unwrap();
         for (off, _) in Lagging::new(&gpu, 5, MotionKind::Jump, 192, 120).by_silhouettes() {

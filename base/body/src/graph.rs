@@ -1,6 +1,6 @@
 //! Deformation graph: nodes on the surface, their neighbours, and the Gaussians that they move.
 
-use std::cmp::Ordering;
+use std::cmp::Reverse;
 use std::collections::BinaryHeap;
 use std::collections::binary_heap::PeekMut;
 
@@ -118,7 +118,7 @@ pub fn displacement(rest: &[Vec3], translations: &[DVec3], nodes: [u32; 4], weig
 /// node.
 const LEAST_WEIGHT: f32 = 0.5 / 255.0;
 
-/// Distances along the surface that wait for a search in one bucket, metres.
+/// Width of a bucket of the search, metres along the surface.
 const BUCKET_M: f32 = 5e-4;
 
 /// Marker of a missing node.
@@ -143,53 +143,29 @@ fn hang(point: Vec3, nearest: &[u32; NEAREST + 1], nodes: &[Vec3], sigma2_m2: f6
     )
 }
 
-/// Point reached along the surface; the nearest leaves a heap first.
-struct Reached {
-    distance: f32,
-    gaussian: u32,
-}
-
-impl Ord for Reached {
-    fn cmp(&self, other: &Self) -> Ordering {
-        other.distance.total_cmp(&self.distance).then_with(|| other.gaussian.cmp(&self.gaussian))
-    }
-}
-
-impl PartialOrd for Reached {
-    fn partial_cmp(&self, other: &Self) -> Option<Ordering> {
-        Some(self.cmp(other))
-    }
-}
-
-impl PartialEq for Reached {
-    fn eq(&self, other: &Self) -> bool {
-        self.cmp(other) == Ordering::Equal
-    }
-}
-
-impl Eq for Reached {}
-
 /// Selects points by farthest-point sampling along the surface. Each component gets its first node before any gets a second.
 fn farthest_points(links: &SurfaceLinks, count: usize, nodes: usize) -> Vec<u32> {
     let mut distance = vec![f32::INFINITY; count];
-    // Distances only fall: an outdated entry sinks to its place. Lower indices first.
-    let mut farthest: BinaryHeap<(Far, std::cmp::Reverse<u32>)> =
-        (0..count as u32).map(|i| (Far(f32::INFINITY), std::cmp::Reverse(i))).collect();
+    // Distances are not negative, so that their bits have their order; they only fall: an outdated entry sinks to its place. Lower
+    // indices first.
+    let unreached = f32::INFINITY.to_bits();
+    let mut farthest: BinaryHeap<(u32, Reverse<u32>)> = (0..count as u32).map(|i| (unreached, Reverse(i))).collect();
     let mut chosen = Vec::with_capacity(nodes);
     let mut front = BinaryHeap::new();
     while chosen.len() < nodes {
         let Some(mut first) = farthest.peek_mut() else { break };
-        let (Far(known), std::cmp::Reverse(gaussian)) = &mut *first;
-        let (gaussian, now) = (*gaussian, distance[*gaussian as usize]);
-        if now < *known {
-            *known = now;
+        let gaussian = first.1.0;
+        let now = distance[gaussian as usize].to_bits();
+        if now < first.0 {
+            first.0 = now;
             continue;
         }
         PeekMut::pop(first);
         chosen.push(gaussian);
         distance[gaussian as usize] = 0.0;
-        front.push(Reached { distance: 0.0, gaussian });
-        while let Some(Reached { distance: so_far, gaussian }) = front.pop() {
+        front.push(Reverse((0, gaussian)));
+        while let Some(Reverse((so_far, gaussian))) = front.pop() {
+            let so_far = f32::from_bits(so_far);
             if so_far > distance[gaussian as usize] {
                 continue;
             }
@@ -197,29 +173,12 @@ fn farthest_points(links: &SurfaceLinks, count: usize, nodes: usize) -> Vec<u32>
                 let new = so_far + step;
                 if new < distance[next as usize] {
                     distance[next as usize] = new;
-                    front.push(Reached { distance: new, gaussian: next });
+                    front.push(Reverse((new.to_bits(), next)));
                 }
             }
         }
     }
     chosen
-}
-
-#[derive(PartialEq)]
-struct Far(f32);
-
-impl Eq for Far {}
-
-impl PartialOrd for Far {
-    fn partial_cmp(&self, other: &Self) -> Option<Ordering> {
-        Some(self.cmp(other))
-    }
-}
-
-impl Ord for Far {
-    fn cmp(&self, other: &Self) -> Ordering {
-        self.0.total_cmp(&other.0)
-    }
 }
 
 /// Returns the five nearest nodes of each Gaussian along the surface, nearest first, [`NONE`] where there are fewer: one Dijkstra

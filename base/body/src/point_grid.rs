@@ -105,12 +105,14 @@ impl PointGrid {
             let block = self.block(self.cell_of(self.sorted[first].1));
             let last = (self.starts[block + 1] as usize).min(places.end);
             let points = &self.sorted[first..last];
-            let low = points.iter().map(|(_, point)| *point).fold(Vec3::INFINITY, Vec3::min) - radius;
-            let high = points.iter().map(|(_, point)| *point).fold(Vec3::NEG_INFINITY, Vec3::max) + radius;
+            let finite = || points.iter().map(|(_, point)| *point).filter(|point| point.is_finite());
+            let low = finite().fold(Vec3::INFINITY, Vec3::min);
+            let high = finite().fold(Vec3::NEG_INFINITY, Vec3::max);
             gathered.clear();
-            self.for_each_row(low, high, |row| {
+            self.for_each_row(low - radius, high + radius, |row| {
                 for (place, (_, point)) in row.clone().zip(&self.sorted[row]) {
-                    if (low.x..=high.x).contains(&point.x) {
+                    // Differences are rounded as those of the distances are.
+                    if point.x - high.x <= radius && low.x - point.x <= radius {
                         gathered.push(place as u32, *point);
                     }
                 }

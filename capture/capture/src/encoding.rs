@@ -12,7 +12,7 @@ use crate::stage::FrameStage;
 #[derive(Debug)]
 pub struct JpegEncoding {
     quality: i32,
-    /// Made with the first image, where making it can fail.
+    /// Encoder; made with the first image, since making it can fail.
     compressor: Option<Compressor>,
     rgb: Vec<u8>,
     scratch: JpegScratch,
@@ -29,7 +29,7 @@ impl JpegEncoding {
     /// Compresses an image, with half as many samples of colour in each direction as of brightness (4:2:0).
     ///
     /// # Errors
-    /// `Unsupported` and `Corrupt` for images that cannot be converted to RGB first.
+    /// `Unsupported` and `Corrupt` for images that cannot be converted to RGB or compressed.
     pub fn encode(&mut self, image: &Image) -> Result<Image, CaptureError> {
         let corrupt = |text: String| CaptureError::general(CaptureErrorKind::Corrupt, text);
         rgb::convert(image, &mut self.rgb, &mut self.scratch)?;
@@ -94,6 +94,14 @@ mod tests {
         // As it came, so it passes.
         let bytes = made.image.bytes().to_vec();
         assert_eq!(stage.process(made).unwrap().image.bytes(), bytes);
+        let header = turbojpeg::read_header(&bytes).unwrap();
+        assert_eq!(header.subsamp, Subsamp::Sub2x2);
+        let coarse = JpegEncoding::new(30).process(frame(PixelFormat::Rgb8, rgb)).unwrap();
+        assert!(2 * coarse.image.bytes().len() < bytes.len());
+        // Another size and another format.
+        let small = Image::new(16, 8, PixelFormat::Rgb8, vec![200; 16 * 8 * 3]).unwrap();
+        let small = stage.encode(&small).unwrap();
+        assert!(small.width() == 16 && to_rgb8(&small).unwrap().iter().all(|c| c.abs_diff(200) <= 2));
         let yuyv = stage.process(frame(PixelFormat::Yuyv, vec![128; 48 * 32 * 2])).unwrap();
         assert!(to_rgb8(&yuyv.image).unwrap().iter().all(|c| c.abs_diff(130) <= 2));
     }

@@ -13,7 +13,7 @@ use ac_ffmpeg::{
 };
 use flyrig_capture::{Decoding, FrameStage as _};
 use flyrig_types::{Frame, Image, PixelFormat};
-use jpeg_encoder::{ColorType, SamplingFactor};
+use jpeg_encoder::{ChromaSubsamplingMethod, ColorType, SamplingFactor};
 use zune_jpeg::{
     JpegDecoder,
     zune_core::{bytestream::ZCursor, colorspace::ColorSpace, options::DecoderOptions},
@@ -186,6 +186,7 @@ impl Encoder {
                 let mut bytes = Vec::new();
                 let mut encoder = jpeg_encoder::Encoder::new(&mut bytes, *quality);
                 encoder.set_sampling_factor(SamplingFactor::R_4_2_0);
+                encoder.set_chroma_subsampling_method(ChromaSubsamplingMethod::Average);
                 encoder.set_restart_interval(*interval);
                 encoder.encode(rgb, width as u16, height as u16, ColorType::Rgb).unwrap();
                 bytes

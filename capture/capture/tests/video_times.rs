@@ -8,12 +8,7 @@ use std::{fs, path::Path, time::Duration};
 
 use flyrig_capture::{CameraSource, CaptureErrorKind, VideoOptions, VideoReplay};
 
-use film::{Film, millis};
-
-/// Returns the colour of frame `i` of the films.
-fn ever_brighter(i: u8) -> [u8; 3] {
-    [60 + 3 * i; 3]
-}
+use film::{Film, film};
 
 /// Reads a video: times in milliseconds, luma on the left, and the texts of errors.
 fn read(path: &Path) -> (Vec<f64>, Vec<u8>, Vec<String>) {
@@ -61,17 +56,7 @@ fn every_frame_has_its_own_time_in_every_container() {
         for (rate, times) in [("constant", constant.clone()), ("variable", variable())] {
             let name = format!("{container} {codec} {reordered} {rate}");
             let path = dir.path().join("film");
-            Film {
-                container,
-                codec,
-                time_base: millis(),
-                color: ever_brighter,
-                reordered,
-                times: times.clone(),
-                sound: 0,
-                muxing: &[],
-            }
-            .write(&path);
+            film(container, codec, reordered, times.clone()).write(&path);
             assert_times(&name, &path, &times);
         }
     }
@@ -82,44 +67,14 @@ fn a_header_that_promises_more_is_no_damage() {
     let dir = tempfile::tempdir().unwrap();
     let path = dir.path().join("film");
     // OpenCV and others multiply the length of the whole file by the frame rate.
-    Film {
-        container: "matroska",
-        codec: "mpeg4",
-        time_base: millis(),
-        color: ever_brighter,
-        reordered: 2,
-        times: variable(),
-        sound: 6000,
-        muxing: &[],
-    }
-    .write(&path);
+    Film { sound: 6000, ..film("matroska", "mpeg4", 2, variable()) }.write(&path);
     assert_times("longer sound", &path, &variable());
     // A pipe: the length is unknown.
     let live = [("live", "1")];
-    Film {
-        container: "matroska",
-        codec: "mpeg4",
-        time_base: millis(),
-        color: ever_brighter,
-        reordered: 0,
-        times: variable(),
-        sound: 0,
-        muxing: &live,
-    }
-    .write(&path);
+    Film { muxing: &live, ..film("matroska", "mpeg4", 0, variable()) }.write(&path);
     assert_times("live", &path, &variable());
     let times: Vec<i64> = (0..40).map(|i| 40 * i).collect();
-    Film {
-        container: "avi",
-        codec: "mjpeg",
-        time_base: millis(),
-        color: ever_brighter,
-        reordered: 0,
-        times: times.clone(),
-        sound: 0,
-        muxing: &[],
-    }
-    .write(&path);
+    film("avi", "mjpeg", 0, times.clone()).write(&path);
     let mut bytes = fs::read(&path).unwrap();
     for (chunk, offset) in [(b"avih", 8 + 16), (b"strh", 8 + 32)] {
         let at = bytes.windows(4).position(|window| window == chunk).unwrap() + offset;
@@ -136,17 +91,7 @@ fn frames_before_the_start_of_an_edit_are_not_shown() {
     let times: Vec<i64> = (-8..32).map(|i| 40 * i).collect();
     // The writer keeps them in the file and skips them with an edit list.
     let muxing = [("avoid_negative_ts", "disabled")];
-    Film {
-        container: "mp4",
-        codec: "mpeg4",
-        time_base: millis(),
-        color: ever_brighter,
-        reordered: 2,
-        times,
-        sound: 0,
-        muxing: &muxing,
-    }
-    .write(&path);
+    Film { muxing: &muxing, ..film("mp4", "mpeg4", 2, times) }.write(&path);
     assert_times("edit list", &path, &(0..32).map(|i| 40 * i).collect::<Vec<_>>());
 }
 
@@ -154,17 +99,7 @@ fn frames_before_the_start_of_an_edit_are_not_shown() {
 fn a_film_of_a_turned_camera_is_upright() {
     let dir = tempfile::tempdir().unwrap();
     let path = dir.path().join("film");
-    Film {
-        container: "mp4",
-        codec: "mpeg4",
-        time_base: millis(),
-        color: ever_brighter,
-        reordered: 0,
-        times: vec![0, 40],
-        sound: 0,
-        muxing: &[],
-    }
-    .write(&path);
+    film("mp4", "mpeg4", 0, vec![0, 40]).write(&path);
     let bytes = fs::read(&path).unwrap();
     let at = bytes.windows(4).position(|window| window == b"tkhd").unwrap() + 4 + 40;
     // The bright half lies on the left of the stored image. Columns: a, b, c, d of the matrix, and where it is then.
@@ -201,17 +136,7 @@ fn a_file_that_is_cut_is_reported_once_behind_its_whole_frames() {
         ("matroska", "mpeg4", &[]),
         ("avi", "mjpeg", &[]),
     ] {
-        Film {
-            container,
-            codec,
-            time_base: millis(),
-            color: ever_brighter,
-            reordered: 0,
-            times: variable(),
-            sound: 0,
-            muxing,
-        }
-        .write(&path);
+        Film { muxing, ..film(container, codec, 0, variable()) }.write(&path);
         let whole = fs::read(&path).unwrap();
         fs::write(&path, &whole[..whole.len() * 4 / 5]).unwrap();
         let (times, lumas, errors) = read(&path);

@@ -83,7 +83,7 @@ impl Body<'_> {
         }
     }
 
-    /// Returns the vertices whose strongest joint is `joint` or hangs below it.
+    /// Returns the vertices whose strongest joint is `joint` or hangs below it, ascending.
     fn vertices_below(&self, joint: usize) -> Vec<usize> {
         let joints = 0..self.template.skeleton.joints().len();
         let below: Vec<bool> = joints.map(|other| self.is_below(other, joint)).collect();

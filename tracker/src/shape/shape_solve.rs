@@ -11,7 +11,7 @@ use rayon::prelude::*;
 use crate::pose::body_model::{BodyModel, JointTurns};
 use crate::pose::fit::{FitProblem, ShapeDerivatives};
 use crate::pose::line_point::LinePoint;
-use crate::shape::body_shape::ShapeSpace;
+use crate::shape::body_shape::{ShapeSpace, UnscaledBody};
 
 /// Step of the finite differences by the shape's parameters.
 const STEP: f64 = 0.01;
@@ -75,9 +75,14 @@ impl ShapeProblem<'_> {
         then(&FitProblem { model, lines: &outline, ..set.problem.clone() })
     }
 
-    /// Returns the derivatives of a model by the parameters of its shape.
-    fn derivatives(&self, shape: &[f64], template: &Template, model: &BodyModel) -> Option<ShapeDerivatives> {
-        let unscaled = self.space.unscaled(shape).ok()?;
+    /// Returns the derivatives of a model by the parameters of its shape; `unscaled` is its body before scale, lengths and
+    /// girths.
+    fn derivatives(
+        &self,
+        shape: &[f64],
+        unscaled: &UnscaledBody<'_>,
+        (template, model): (&Template, &BodyModel),
+    ) -> Option<ShapeDerivatives> {
         let columns: Vec<_> = (0..shape.len())
             .into_par_iter()
             .map(|k| {
@@ -86,7 +91,7 @@ impl ShapeProblem<'_> {
                 let mut moved = shape.to_vec();
                 moved[k] += step;
                 let of_targets = ShapeSpace::is_target(k).then(|| self.space.unscaled(&moved)).transpose().ok()?;
-                let other = of_targets.as_ref().unwrap_or(&unscaled).scaled(&moved).ok()?;
+                let other = of_targets.as_ref().unwrap_or(unscaled).scaled(&moved).ok()?;
                 let other_model = BodyModel::new(&other).ok()?;
                 let change = |a: DVec3, b: DVec3| (a - b) / step;
                 let pairs = |a: &[DVec3], b: &[DVec3]| a.iter().zip(b).map(|(a, b)| change(*a, *b)).collect::<Vec<_>>();
@@ -134,8 +139,10 @@ impl Problem for ShapeProblem<'_> {
     }
 
     fn linearize(&self, at: &ShapeAndPoses) -> Option<ArrowNormal> {
-        let (template, model) = self.model(&at.shape)?;
-        let derivatives = self.derivatives(&at.shape, &template, &model)?;
+        let unscaled = self.space.unscaled(&at.shape).ok()?;
+        let template = unscaled.scaled(&at.shape).ok()?;
+        let model = BodyModel::new(&template).ok()?;
+        let derivatives = self.derivatives(&at.shape, &unscaled, (&template, &model))?;
         let count = at.shape.len();
         let mut kept = DenseNormal::zeros(count);
         for (k, (error, slope)) in self.prior(&at.shape).into_iter().enumerate() {

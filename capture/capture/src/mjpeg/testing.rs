@@ -1,6 +1,6 @@
 //! Images for tests.
 
-use jpeg_encoder::{ColorType, Encoder, SamplingFactor};
+use jpeg_encoder::{ChromaSubsamplingMethod, ColorType, Encoder, SamplingFactor};
 
 /// Encodes a picture that moves by `shift` as 4:2:0 with a restart marker after every `interval` MCUs; none for 0.
 pub fn encoded(width: u16, height: u16, interval: u16, shift: i32) -> Vec<u8> {
@@ -13,6 +13,7 @@ pub fn encoded(width: u16, height: u16, interval: u16, shift: i32) -> Vec<u8> {
     let mut jpeg = Vec::new();
     let mut encoder = Encoder::new(&mut jpeg, 85);
     encoder.set_sampling_factor(SamplingFactor::R_4_2_0);
+    encoder.set_chroma_subsampling_method(ChromaSubsamplingMethod::Average);
     encoder.set_restart_interval(interval);
     encoder.encode(&bytes, width, height, ColorType::Rgb).unwrap();
     jpeg

@@ -17,7 +17,7 @@ use ac_ffmpeg::{
 };
 
 /// Returns a time base of 1 ms.
-pub fn millis() -> TimeBase {
+fn millis() -> TimeBase {
     TimeBase::new(1, 1000)
 }
 
@@ -26,7 +26,7 @@ pub struct Film<'a> {
     pub container: &'a str,
     pub codec: &'a str,
     pub time_base: TimeBase,
-    /// Returns the colour (sRGB) of a frame's left half; the right half is black.
+    /// Returns the colour (sRGB) of the left half of a frame by its number; the right half is black.
     pub color: fn(u8) -> [u8; 3],
     /// Largest number of consecutive frames that are stored after a later one.
     pub reordered: u32,
@@ -35,6 +35,12 @@ pub struct Film<'a> {
     /// Length of the sound track, milliseconds; none for 0.
     pub sound: i64,
     pub muxing: &'a [(&'a str, &'a str)],
+}
+
+/// Returns a film without sound whose frames become ever brighter.
+pub fn film<'a>(container: &'a str, codec: &'a str, reordered: u32, times: Vec<i64>) -> Film<'a> {
+    let color = |i: u8| [60 + 4 * i; 3];
+    Film { container, codec, time_base: millis(), color, reordered, times, sound: 0, muxing: &[] }
 }
 
 impl Film<'_> {

@@ -44,7 +44,7 @@ pub struct PerceptionSettings {
     /// Largest number of tracked people, 1 to 4; with 1 the person on whom most views agree.
     #[arg(long, default_value_t = 1)]
     pub people: usize,
-    /// Landmark network: "full" or "lite" (built in; a fifth less time, less accurate), an ONNX file with another BlazePose, or a
+    /// Landmark network: "full" or "lite" (built in; 4 to 8 ms less per frame set, less accurate), an ONNX file with another BlazePose, or a
     /// TOML file that describes any other network, which needs two cameras or more (docs/guide/people.md). Empty: "full".
     #[arg(long, value_name = "NETWORK", default_value = "", hide_default_value = true,
         value_parser = OsStringValueParser::new().map(PathBuf::from))]
