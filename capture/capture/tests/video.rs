@@ -10,21 +10,13 @@ use ac_ffmpeg::time::TimeBase;
 use flyrig_capture::{CameraSource, CaptureError, CaptureErrorKind, VideoOptions, VideoReplay};
 use flyrig_types::{Frame, PixelFormat};
 
-use film::Film;
+use film::{Film, film};
 
 /// Writes a video of `count` frames at 25 per second whose red grows by 20 per frame.
 fn write(path: &Path, (container, codec): (&str, &str), count: i64) {
-    let film = Film {
-        container,
-        codec,
-        time_base: TimeBase::new(1, 25),
-        color: |i| [20 * i, 100, 10],
-        reordered: 0,
-        times: (0..count).map(|i| 40 * i).collect(),
-        sound: 0,
-        muxing: &[],
-    };
-    film.write(path);
+    let times = (0..count).map(|i| 40 * i).collect();
+    let color = |i: u8| [20 * i, 100, 10];
+    Film { time_base: TimeBase::new(1, 25), color, ..film(container, codec, 0, times) }.write(path);
 }
 
 fn all(source: &mut VideoReplay) -> Vec<Result<Frame, CaptureError>> {
