@@ -10,6 +10,7 @@ use flyrig_report::{progress_bar, stop};
 use flyrig_types::{Camera, FrameSet};
 use glam::Vec2;
 
+use crate::outline_memory::remember_outlines;
 use crate::replay::{Replay, frame_number};
 
 /// Tracked take.
@@ -72,6 +73,10 @@ impl AvatarTake {
         let surface = if deforms { surface.inset() } else { surface };
         let colors: Vec<[f32; 3]> = replay.session.splats(person)?.iter().map(|splat| splat.color).collect();
         let mut avatar = Avatar::new(subject.template(), &surface, deforms.then_some(&graph), &colors, order)?;
+        if deforms {
+            let moved_m = remember_outlines(&mut frames, &views, &avatar, (&graph, &surface.normals));
+            tracing::debug!(mm = 1e3 * moved_m, "nodes moved to where outlines of other frames show them");
+        }
         avatar.set_mean(frames.iter().map(|frame: &TrainingFrame| frame.translations.as_slice()));
         avatar.known_poses = KnownPoses::new(&poses);
         let camera = replay.session.rig().cameras.first().cloned().context("no camera")?;

@@ -16,6 +16,7 @@ mod import;
 mod known_avatar;
 mod network;
 mod open;
+mod outline_memory;
 mod person_tracks;
 mod person_up;
 pub mod recorded;

@@ -59,6 +59,7 @@ pub(crate) fn eliminate(points: Vec<Vec3>, normals: Vec<Vec3>, keep: usize, area
     order.iter().enumerate().for_each(|(place, &index)| places[index as usize] = place as u32);
     let mut heaviest = MonotoneQueue::new(|entry: &u64| (entry >> BITS_IN_A_BUCKET) as usize);
     places.iter().enumerate().for_each(|(index, &place)| heaviest.push(entry(weights[place as usize], index)));
+    // By place.
     let mut alive = vec![true; count];
     let mut left = count;
     while left > keep {
@@ -71,14 +72,15 @@ pub(crate) fn eliminate(points: Vec<Vec3>, normals: Vec<Vec3>, keep: usize, area
             heaviest.push(now);
             continue;
         }
-        alive[index] = false;
+        alive[place] = false;
         left -= 1;
-        for &neighbor in of_point(place) {
-            let neighbor = neighbor as usize;
-            weights[neighbor] -= weight(placed[place].distance_squared(placed[neighbor]).sqrt());
+        for neighbor in of_point(place).iter().map(|&neighbor| neighbor as usize) {
+            if alive[neighbor] {
+                weights[neighbor] -= weight(placed[place].distance_squared(placed[neighbor]).sqrt());
+            }
         }
     }
-    (0..count).filter(|&i| alive[i]).collect()
+    (0..count).filter(|&i| alive[places[i] as usize]).collect()
 }
 
 /// Lowest bits of an entry that may differ within a bucket: steps of less than a hundredth of the weight.

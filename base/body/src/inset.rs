@@ -20,14 +20,15 @@ impl SurfaceGaussians {
     #[must_use]
     pub fn inset(&self) -> Self {
         let mut moved = self.clone();
-        let grid = PointGrid::new(&self.positions, THICKEST_M / 4.0);
+        // Only points less deep than this limit a movement. Those that count lie less than half their depth aside: within
+        // sqrt(1.25) < 1.12 depths.
+        let radius = |scale_m: f32| THICKEST_M.min(1.12 * DRAWN_BEYOND * scale_m / (0.5 * OF_HALF));
+        let mean = self.scale_m.iter().sum::<f32>() / self.len().max(1) as f32;
+        let grid = PointGrid::new(&self.positions, 0.5 * radius(mean));
         let half_thickness = |i: usize| {
             let (point, normal) = (self.positions[i], self.normals[i]);
             let mut least = THICKEST_M;
-            // Only points less deep than this limit the movement. Those that count lie less than half their depth aside: within
-            // sqrt(1.25) < 1.12 depths.
-            let limiting = DRAWN_BEYOND * self.scale_m[i] / (0.5 * OF_HALF);
-            grid.within(point, THICKEST_M.min(1.12 * limiting), |j, _| {
+            grid.within(point, radius(self.scale_m[i]), |j, _| {
                 // On the other side, and below this point.
                 let depth = (point - self.positions[j]).dot(normal);
                 if depth > 1e-3 && self.normals[j].dot(normal) < -0.5 {

@@ -88,11 +88,14 @@ pub fn sample_surface(template: &Template, count: usize, seed: u64) -> Result<Su
 
     let mut rng = rand::rngs::StdRng::seed_from_u64(seed);
     let thrown = count * CANDIDATES_PER_GAUSSIAN;
+    let mut triangle = 0;
     let candidates: Vec<(u32, [f32; 3])> = (0..thrown)
         .map(|i| {
             // One point in each of `thrown` equal shares of the area.
             let at = (i as f64 + rng.random::<f64>()) / thrown as f64 * area;
-            let triangle = area_up_to.partition_point(|&end| end < at).min(area_up_to.len() - 1);
+            while triangle + 1 < area_up_to.len() && area_up_to[triangle] < at {
+                triangle += 1;
+            }
             let (mut v, mut w): (f32, f32) = (rng.random(), rng.random());
             if v + w > 1.0 {
                 (v, w) = (1.0 - v, 1.0 - w);
@@ -102,16 +105,16 @@ pub fn sample_surface(template: &Template, count: usize, seed: u64) -> Result<Su
         .collect();
     let position = |candidate: (u32, [f32; 3])| blend(template, &template.positions, candidate);
     let kept = eliminate(
-        candidates.iter().map(|&c| position(c)).collect(),
-        candidates.iter().map(|&c| normal_at(template, c)).collect(),
+        candidates.par_iter().map(|&c| position(c)).collect(),
+        candidates.par_iter().map(|&c| normal_at(template, c)).collect(),
         count,
         area,
     );
     let candidates: Vec<(u32, [f32; 3])> = kept.iter().map(|&i| candidates[i]).collect();
     drop(kept);
 
-    let positions = candidates.iter().map(|&c| position(c)).collect();
-    let skin = candidates.iter().map(|&c| blend_skin(template, c)).collect();
+    let positions = candidates.par_iter().map(|&c| position(c)).collect();
+    let skin = candidates.par_iter().map(|&c| blend_skin(template, c)).collect();
     Ok(described(template, &candidates, positions, skin))
 }
 
@@ -147,7 +150,7 @@ fn described(
     positions: Vec<Vec3>,
     skin: Vec<SkinWeights>,
 ) -> SurfaceGaussians {
-    let normals: Vec<Vec3> = attachments.iter().map(|&attachment| normal_at(template, attachment)).collect();
+    let normals: Vec<Vec3> = attachments.par_iter().map(|&attachment| normal_at(template, attachment)).collect();
     let spacing = (template.area_m2() / attachments.len() as f64).sqrt() as f32;
     let scale_m = scales(&positions, &normals, spacing);
     let part_of_joint = part_of_joints(&template.skeleton);

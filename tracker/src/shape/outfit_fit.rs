@@ -181,14 +181,12 @@ fn find_skirt(body: &Template, worn: Outfit, seen: &MaskedPoses<'_>) -> Option<S
     if targets.is_empty() {
         return None;
     }
+    let worn = worn.on(body).ok()?;
     let best_of = |skirts: &mut dyn Iterator<Item = Skirt>| -> Option<(Skirt, f64)> {
-        let tried = skirts.map(|skirt| {
-            let outfit = Outfit { skirt: Some(skirt), ..worn };
-            (skirt, overlap(&targets, &seen.poses, outfit.on(body)))
-        });
+        let tried = skirts.map(|skirt| (skirt, overlap(&targets, &seen.poses, skirt.on(&worn))));
         tried.max_by(|a, b| a.1.total_cmp(&b.1))
     };
-    let without = overlap(&targets, &seen.poses, worn.on(body));
+    let without = overlap(&targets, &seen.poses, Ok(worn.clone()));
     let (best, first) = best_of(&mut LENGTHS.into_iter().map(|length| Skirt { length, flare: FIRST_FLARE }))?;
     let (best, gain) = if first > without {
         let (best, _) = best_of(&mut FLARES.into_iter().map(|flare| Skirt { flare, ..best }))?;

@@ -9,7 +9,7 @@ use std::{
 };
 
 use flyrig_avatar::Avatar;
-use flyrig_body::{Outfit, Template};
+use flyrig_body::Template;
 use flyrig_fit::{ErrorWeights, ImageDifference};
 use flyrig_gpu::GpuContext;
 use flyrig_renderer::{HarmonicOrder, Outputs, RasterSettings, Rasterizer, RenderTarget};
@@ -103,10 +103,10 @@ impl Judge {
     }
 
     fn stand_in(&self) -> Result<StandIn, FusionError> {
-        let (worn, base) = ((self.template.clone(), Outfit::default()), Arc::clone(&self.base));
+        let base = Arc::clone(&self.base);
         let rasterizer = Rasterizer::new(&self.gpu, base.surface.len())?;
         let with = (&self.rig, &self.settings);
-        let subject = Subject::of_surface(&self.gpu, PersonId::default(), worn, (base, None), with)?;
+        let subject = Subject::of_surface(&self.gpu, PersonId::default(), self.template.clone(), base, with)?;
         Ok(StandIn { subject, rasterizer, target: None })
     }
 

@@ -65,6 +65,7 @@ impl GaussianPainter {
             settings: settings.appearance.mode.settings(),
             visibility: Vec::new(),
             painted: Vec::new(),
+            next: 0,
         };
         if is_avatar {
             direct.settings.corrects = true;
@@ -193,30 +194,43 @@ impl GaussianPainter {
 pub(super) struct DirectPainter {
     appearance: DirectAppearance,
     settings: AppearanceSettings,
-    /// One target per input view; grows with the rig, and is remade when an image's size changes.
+    /// One target for each view that paints, remade when an image has another size.
     visibility: Vec<RenderTarget>,
-    /// Views that painted in the last update.
+    /// Views that painted in the last update, ascending.
     painted: Vec<usize>,
+    /// First view whose turn it is next.
+    next: usize,
 }
+
+/// Largest number of views that paint in one set; of more they take turns.
+const MOST_PAINTING: usize = 4;
 
 impl DirectPainter {
     fn paint(&mut self, inputs: PaintInputs<'_>, tools: &mut PaintTools<'_>) -> Result<(), FusionError> {
-        self.painted.clear();
+        self.choose_views(inputs);
         self.render_views(inputs, tools)?;
         self.update(inputs, tools)
     }
 
-    /// Renders canonical positions and the last colours into every view.
+    /// Chooses the views that paint: the trusted ones, of many those whose turn it is.
+    fn choose_views(&mut self, PaintInputs { geometry, views, .. }: PaintInputs<'_>) {
+        self.painted.clear();
+        self.painted.extend((0..views.len()).filter(|&view| geometry.is_trusted(view)));
+        take_turns(&mut self.painted, &mut self.next);
+    }
+
+    /// Renders canonical positions and the last colours into the views that paint.
     fn render_views(&mut self, inputs: PaintInputs<'_>, tools: &mut PaintTools<'_>) -> Result<(), FusionError> {
         let PaintInputs { gpu, geometry, instants, views, .. } = inputs;
         let start = Instant::now();
         let settings = RasterSettings { outputs: Outputs::SURFACE, ..RasterSettings::default() };
-        for (i, view) in views.iter().enumerate() {
-            self.fit_target(gpu, i, (view.image.width(), view.image.height()))?;
+        for at in 0..self.painted.len() {
+            let view = &views[self.painted[at]];
+            self.fit_target(gpu, at, (view.image.width(), view.image.height()))?;
             let mut encoder = gpu.device.create_command_encoder(&Default::default());
-            let gaussians = geometry.drawn(instants.of_view(i));
-            tools.rasterizer.encode(gpu, &mut encoder, gaussians, view.camera, &settings, &self.visibility[i])?;
-            if i + 1 == views.len() {
+            let gaussians = geometry.drawn(instants.of_view(self.painted[at]));
+            tools.rasterizer.encode(gpu, &mut encoder, gaussians, view.camera, &settings, &self.visibility[at])?;
+            if at + 1 == self.painted.len() {
                 tools.clock.mark(&mut encoder, TimedStage::Visibility);
             }
             gpu.queue.submit([encoder.finish()]);
@@ -224,36 +238,35 @@ impl DirectPainter {
         tools.clock.wait(gpu, TimedStage::Visibility, start, tools.stages)
     }
 
-    /// Gives a view a target of its image's size.
-    fn fit_target(&mut self, gpu: &GpuContext, view: usize, (width, height): (u32, u32)) -> Result<(), FusionError> {
-        if self.visibility.get(view).is_some_and(|target| (target.width, target.height) == (width, height)) {
+    /// Gives the view that paints as number `at` a target of its image's size.
+    fn fit_target(&mut self, gpu: &GpuContext, at: usize, (width, height): (u32, u32)) -> Result<(), FusionError> {
+        if self.visibility.get(at).is_some_and(|target| (target.width, target.height) == (width, height)) {
             return Ok(());
         }
         let target = RenderTarget::new(gpu, width, height)?;
-        if view < self.visibility.len() {
-            self.visibility[view] = target;
+        if at < self.visibility.len() {
+            self.visibility[at] = target;
         } else {
             self.visibility.push(target);
         }
         Ok(())
     }
 
-    /// Updates direct appearance from the trusted views.
+    /// Updates direct appearance from the views that paint.
     fn update(&mut self, inputs: PaintInputs<'_>, tools: &mut PaintTools<'_>) -> Result<(), FusionError> {
         let PaintInputs { gpu, geometry, instants, views, images } = inputs;
         let start = Instant::now();
-        self.painted.extend((0..views.len()).filter(|&i| geometry.is_trusted(i)));
-        let observing: Vec<ViewInput<'_>> = (self.painted.iter())
-            .map(|&i| ViewInput {
+        let observing: Vec<ViewInput<'_>> = (self.painted.iter().zip(&self.visibility))
+            .map(|(&i, visibility)| ViewInput {
                 camera: views[i].camera,
                 picture: &images.images()[i].words,
-                canonical: &self.visibility[i].canonical,
-                rendered: &self.visibility[i].color,
+                canonical: &visibility.canonical,
+                rendered: &visibility.color,
                 gaussians: (instants.of_view(i) > 0).then(|| geometry.at(instants.of_view(i))),
             })
             .collect();
         let mut encoder = gpu.device.create_command_encoder(&Default::default());
-        if views.is_empty() {
+        if self.painted.is_empty() {
             tools.clock.mark(&mut encoder, TimedStage::Visibility);
         }
         self.appearance.update(gpu, &mut encoder, geometry.painted(), &observing, &self.settings)?;
@@ -266,6 +279,17 @@ impl DirectPainter {
 
     fn observations(&self, gpu: &GpuContext) -> Result<Observations, FusionError> {
         Ok(self.appearance.observations(gpu, self.painted.len())?)
+    }
+}
+
+/// Keeps [`MOST_PAINTING`] of these views, which are ascending: the ones from `next` on, which becomes the view after them.
+fn take_turns(views: &mut Vec<usize>, next: &mut usize) {
+    if views.len() > MOST_PAINTING {
+        let first = views.iter().position(|view| view >= next).unwrap_or(0);
+        views.rotate_left(first);
+        *next = views[MOST_PAINTING];
+        views.truncate(MOST_PAINTING);
+        views.sort_unstable();
     }
 }
 
@@ -311,5 +335,26 @@ impl LearnedPainter {
         let counts = self.networks.counts;
         stages.count("corrections that were no numbers", counts.poisoned - before.poisoned);
         Ok(())
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn many_views_take_turns_and_few_always_paint() {
+        let mut next = 0;
+        let mut of = |mut views: Vec<usize>| {
+            take_turns(&mut views, &mut next);
+            views
+        };
+        assert_eq!(of(vec![0, 2, 3, 5]), [0, 2, 3, 5]);
+        let six = || (0..6).collect::<Vec<_>>();
+        assert_eq!([of(six()), of(six()), of(six())], [[0, 1, 2, 3], [0, 1, 4, 5], [2, 3, 4, 5]]);
+        // The view whose turn it is, and some after it, are not trusted now.
+        assert_eq!(of(six()), [0, 1, 2, 3]);
+        assert_eq!(of(vec![0, 1, 2, 3, 5]), [0, 1, 2, 5]);
+        assert_eq!(of(Vec::new()), []);
     }
 }

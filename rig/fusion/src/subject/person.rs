@@ -14,7 +14,7 @@
 use std::sync::Arc;
 
 use flyrig_avatar::Avatar;
-use flyrig_body::{DEFAULT_SIGMA2_M2, Outfit, Template, build_graph};
+use flyrig_body::{DEFAULT_SIGMA2_M2, DeformationGraph, Outfit, SurfaceGaussians, Template, build_graph};
 use flyrig_gpu::GpuContext;
 use flyrig_renderer::{GaussianBuffers, Gaussians, Observations, Rasterizer, Splat, read_splats};
 use flyrig_stfa::BodyGraph;
@@ -139,32 +139,48 @@ impl Subject {
                 GraphedSurface { surface, graph }
             }
         };
-        let mut subject = Self::of_surface(gpu, id, (body, outfit), (Arc::new(base), avatar), (rig, settings))?;
-        subject.prepare_stream()?;
-        if !settings.body.learn {
-            subject.base = None;
+        let undressed = (!outfit.is_bare()).then_some((body, outfit));
+        let drawn = base.drawn(settings.tracking.options().is_some());
+        let mut subject = Self::drawn_as(gpu, id, (template, undressed), (&base, &drawn, avatar), (rig, settings))?;
+        if subject.geometry.hung_avatar().is_some() {
+            subject.prepare_stream()?;
+        } else {
+            subject.encode_stream(&drawn, &base.graph)?;
+        }
+        if settings.body.learn {
+            drop(drawn);
+            subject.base = Some(Arc::new(base));
         }
         Ok(subject)
     }
 
-    /// Creates a person with this surface, which is that of the dressed body, and without a template of the person stream.
+    /// Creates a person without clothes of a surface of their own, with this surface and without a template of the person stream.
     pub(crate) fn of_surface(
         gpu: &GpuContext,
         id: PersonId,
-        (body, outfit): (Template, Outfit),
-        (base, avatar): (Arc<GraphedSurface>, Option<&Arc<Avatar>>),
+        template: Template,
+        base: Arc<GraphedSurface>,
         (rig, settings): (&Rig, &SessionSettings),
     ) -> Result<Self, FusionError> {
-        let template = outfit.on(&body)?;
-        let GraphedSurface { surface, graph } = &*base;
-        let is_deformed = settings.tracking.options().is_some();
-        let inset = is_deformed.then(|| surface.inset());
-        let rendered = inset.as_ref().unwrap_or(surface);
+        let drawn = base.drawn(settings.tracking.options().is_some());
+        let subject = Self::drawn_as(gpu, id, (template, None), (&base, &drawn, None), (rig, settings))?;
+        drop(drawn);
+        Ok(Self { base: Some(base), ..subject })
+    }
+
+    /// Creates a person with this surface, which is that of the template, drawn as `drawn`.
+    fn drawn_as(
+        gpu: &GpuContext,
+        id: PersonId,
+        (template, undressed): (Template, Option<(Template, Outfit)>),
+        (GraphedSurface { surface, graph }, drawn, avatar): (&GraphedSurface, &SurfaceGaussians, Option<&Arc<Avatar>>),
+        (rig, settings): (&Rig, &SessionSettings),
+    ) -> Result<Self, FusionError> {
         let body_graph = BodyGraph::new(surface, graph)?;
         Ok(Self {
             id,
             shape_number: 0,
-            geometry: Geometry::new(gpu, &template, (surface, rendered), graph, avatar, (rig, settings))?,
+            geometry: Geometry::new(gpu, &template, (surface, drawn), graph, avatar, (rig, settings))?,
             painter: GaussianPainter::new(
                 gpu,
                 surface,
@@ -173,8 +189,8 @@ impl Subject {
                 (rig.cameras.len(), avatar.is_some()),
                 settings,
             )?,
-            shape: PersonShape { template, undressed: (!outfit.is_bare()).then_some((body, outfit)), stream: None },
-            base: Some(base),
+            shape: PersonShape { template, undressed, stream: None },
+            base: None,
             body_graph,
             inputs: Inputs::default(),
             schedule: Schedule::default(),
@@ -397,17 +413,24 @@ impl Subject {
         if self.shape.stream.is_some() {
             return Ok(());
         }
-        let (skeleton, is_deformed) = (&self.shape.template.skeleton, self.is_deformed());
-        let encoded = match (self.geometry.hung_avatar(), &self.base) {
-            (Some(avatar), _) => encode_tracked_avatar(avatar, skeleton, is_deformed)?,
-            (None, Some(base)) => {
-                let inset = is_deformed.then(|| base.surface.inset());
-                let graph = is_deformed.then_some(&base.graph);
-                encode_template(inset.as_ref().unwrap_or(&base.surface), graph, skeleton)?
+        match (self.geometry.hung_avatar(), &self.base) {
+            (Some(avatar), _) => {
+                let encoded = encode_tracked_avatar(avatar, &self.shape.template.skeleton, self.is_deformed())?;
+                self.shape.stream = Some(Arc::new(encoded));
+                Ok(())
             }
-            (None, None) => return Ok(()),
-        };
-        self.shape.stream = Some(Arc::new(encoded));
+            (None, Some(base)) => {
+                let base = Arc::clone(base);
+                self.encode_stream(&base.drawn(self.is_deformed()), &base.graph)
+            }
+            (None, None) => Ok(()),
+        }
+    }
+
+    /// Encodes the template of the person stream from the Gaussians as they are drawn.
+    fn encode_stream(&mut self, drawn: &SurfaceGaussians, graph: &DeformationGraph) -> Result<(), FusionError> {
+        let graph = self.is_deformed().then_some(graph);
+        self.shape.stream = Some(Arc::new(encode_template(drawn, graph, &self.shape.template.skeleton)?));
         Ok(())
     }
 

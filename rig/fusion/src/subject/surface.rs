@@ -1,5 +1,7 @@
 //! Gaussians on a person's surface, and the graph that deforms them.
 
+use std::borrow::Cow;
+
 use flyrig_body::{
     BodyError, DEFAULT_SIGMA2_M2, DeformationGraph, SurfaceGaussians, Template, build_graph, sample_surface,
 };
@@ -14,6 +16,13 @@ const SURFACE_SEED: u64 = 1;
 pub(crate) struct GraphedSurface {
     pub surface: SurfaceGaussians,
     pub graph: DeformationGraph,
+}
+
+impl GraphedSurface {
+    /// Returns the Gaussians as they are drawn: inset where they are deformed.
+    pub fn drawn(&self, is_deformed: bool) -> Cow<'_, SurfaceGaussians> {
+        if is_deformed { Cow::Owned(self.surface.inset()) } else { Cow::Borrowed(&self.surface) }
+    }
 }
 
 /// Samples the Gaussians of a session's person on the surface of its template.

@@ -1,0 +1,214 @@
+//! Shape of clothes and hair that the outlines of other frames have shown.
+//!
+//! A mask measures how far a surface stands off the body where the surface's outline runs. Elsewhere the tracked surface is interpolated
+//! between outlines, and a node that no outline passes lacks about the same distance in every such frame. That distance is the mean
+//! difference between its translations at outlines and away from them, along the surface's normal; it is added where no outline runs.
+
+use flyrig_avatar::{Avatar, Bones, PosedAvatar, TrainingFrame};
+use flyrig_body::DeformationGraph;
+use flyrig_fit::TrainingView;
+use glam::{DVec3, Vec3, Vec4};
+use rayon::prelude::*;
+
+/// Standard deviation of the cosine between a surface's normal and the line of sight where its outline runs.
+const GRAZING: f32 = 0.25;
+/// Largest distance of an outline from a surface on either side, metres.
+const BESIDE_M: f32 = 0.03;
+/// Frames at an outline for which a node's difference counts by half.
+const FRAMES: f64 = 2.0;
+/// Rounds of averaging over neighbouring nodes.
+const ROUNDS: usize = 2;
+
+/// Moves the graph's nodes of each frame by what they lack where no outline runs, and returns the mean movement, metres. `views` are the
+/// images of the frames with their masks, `normals` the canonical unit normals of the Gaussians that the graph was built on.
+pub fn remember_outlines(
+    frames: &mut [TrainingFrame],
+    views: &[TrainingView],
+    avatar: &Avatar,
+    (graph, normals): (&DeformationGraph, &[Vec3]),
+) -> f64 {
+    let normals: Vec<DVec3> = graph.node_gaussian.iter().map(|&at| normals[at as usize].as_dvec3()).collect();
+    let outlined: Vec<Vec<f64>> =
+        frames.par_iter().enumerate().map(|(at, frame)| outlined(frame, at, views, avatar, graph)).collect();
+    let mut lacking = lacking(frames, &outlined, &normals);
+    for _ in 0..ROUNDS {
+        let around = |node: usize| graph.neighbors[node].iter().map(|&other| lacking[other as usize]).sum::<f64>();
+        lacking = (0..lacking.len()).map(|node| (lacking[node] + around(node)) / 5.0).collect();
+    }
+    let (mut moved, mut count) = (0.0, 0u32);
+    for (frame, outlined) in frames.iter_mut().zip(&outlined) {
+        for (((translation, outlined), lacking), normal) in
+            frame.translations.iter_mut().zip(outlined).zip(&lacking).zip(&normals)
+        {
+            let by = (1.0 - outlined) * lacking;
+            *translation += *normal * by;
+            moved += by.abs();
+            count += 1;
+        }
+    }
+    moved / f64::from(count.max(1))
+}
+
+/// Returns how far each node stands out less where no outline runs than where one does, metres; 0 for nodes of which one is unknown.
+fn lacking(frames: &[TrainingFrame], outlined: &[Vec<f64>], normals: &[DVec3]) -> Vec<f64> {
+    let of = |(node, normal): (usize, &DVec3)| {
+        let (mut at, mut away) = ([0.0; 2], [0.0; 2]);
+        for (frame, outlined) in frames.iter().zip(outlined) {
+            let Some(translation) = frame.translations.get(node).filter(|by| by.is_finite()) else { continue };
+            let (out, outlined) = (translation.dot(*normal), outlined[node]);
+            at = [at[0] + outlined * out, at[1] + outlined];
+            away = [away[0] + (1.0 - outlined) * out, away[1] + 1.0 - outlined];
+        }
+        if at[1] <= 0.0 || away[1] <= 0.0 {
+            return 0.0;
+        }
+        (at[0] / at[1] - away[0] / away[1]) * at[1] / (at[1] + FRAMES)
+    };
+    normals.iter().enumerate().map(of).collect()
+}
+
+/// Returns how certainly an outline runs at each node in a frame, 0..=1.
+fn outlined(
+    frame: &TrainingFrame,
+    at: usize,
+    views: &[TrainingView],
+    avatar: &Avatar,
+    graph: &DeformationGraph,
+) -> Vec<f64> {
+    let mut posed = PosedAvatar::default();
+    avatar.pose(&Bones::new(&avatar.template.skeleton, &frame.pose), Some(&frame.translations), &mut posed);
+    let normals: Vec<Vec3> = posed.normals().collect();
+    let views: Vec<(&TrainingView, Vec3)> =
+        views.iter().filter(|view| view.frame() == at).map(|view| (view, view.camera().position().as_vec3())).collect();
+    let of_node = |&gaussian: &u32| {
+        let center = Vec4::from(posed.center[gaussian as usize]).truncate();
+        let normal = normals[gaussian as usize];
+        let of_view = |(view, eye): &(&TrainingView, Vec3)| {
+            let sight = (center - *eye).normalize_or_zero();
+            let cosine = normal.dot(sight);
+            let aside = (normal - sight * cosine).normalize_or_zero() * BESIDE_M;
+            let ends = covered(view, center - aside) == Some(true) && covered(view, center + aside) == Some(false);
+            if ends { f64::from((-0.5 * (cosine / GRAZING).powi(2)).exp()) } else { 0.0 }
+        };
+        views.iter().map(of_view).fold(0.0, f64::max)
+    };
+    graph.node_gaussian.iter().map(of_node).collect()
+}
+
+/// Returns whether the mask covers a world point; `None` outside the image.
+fn covered(view: &TrainingView, point: Vec3) -> Option<bool> {
+    let pixel = view.camera().project(point.as_dvec3())?.round();
+    let [width, height] = view.size().map(f64::from);
+    if !(pixel.x >= 0.0 && pixel.y >= 0.0 && pixel.x < width && pixel.y < height) {
+        return None;
+    }
+    let index = (pixel.y * width + pixel.x) as usize;
+    view.rgba().get(4 * index + 3).map(|alpha| *alpha > 127)
+}
+
+#[cfg(test)]
+mod tests {
+    use flyrig_avatar::AvatarScene;
+    use flyrig_body::{DEFAULT_SIGMA2_M2, ShapeParams, build_graph, default_template, sample_surface};
+    use flyrig_gpu::testing::device;
+    use flyrig_renderer::HarmonicOrder;
+    use flyrig_types::{Camera, Intrinsics, Isometry, Lens};
+    use glam::{DQuat, DVec2};
+
+    use super::*;
+
+    const SIZE: u32 = 160;
+    /// Distance by which clothes stand off everywhere, metres.
+    const OFF_M: f64 = 0.02;
+
+    /// Camera that looks at a body which stands at the origin with y up.
+    fn camera(angle: f64) -> Camera {
+        let rotation = DQuat::from_rotation_x(std::f64::consts::PI) * DQuat::from_rotation_y(angle);
+        let place = rotation.inverse() * DVec3::new(0.0, 0.0, -2.6) + DVec3::Y * 0.9;
+        Camera {
+            id: "view".into(),
+            intrinsics: Intrinsics {
+                width: SIZE,
+                height: SIZE,
+                focal_px: DVec2::splat(190.0),
+                center_px: DVec2::splat(f64::from(SIZE) / 2.0),
+                lens: Lens::PINHOLE,
+            },
+            camera_from_world: Isometry { rotation, translation: -(rotation * place) },
+            time_offset_nanos: 0,
+            color: Default::default(),
+        }
+    }
+
+    struct Turn {
+        avatar: Avatar,
+        graph: DeformationGraph,
+        normals: Vec<Vec3>,
+        truth: Vec<DVec3>,
+        frames: Vec<TrainingFrame>,
+        views: Vec<TrainingView>,
+    }
+
+    /// Person who turns before three cameras, in clothes that stand off everywhere.
+    fn turn() -> Turn {
+        let template = default_template(&ShapeParams::default()).unwrap();
+        let surface = sample_surface(&template, 4000, 1).unwrap();
+        let graph = build_graph(&template, &surface, 200, DEFAULT_SIGMA2_M2).unwrap();
+        let avatar = Avatar::new(&template, &surface, Some(&graph), &[[0.5; 3]; 4000], HarmonicOrder::Zero).unwrap();
+        let normals = surface.normals.clone();
+        let truth: Vec<DVec3> = graph.node_gaussian.iter().map(|&at| normals[at as usize].as_dvec3() * OFF_M).collect();
+        let mut scene = AvatarScene::new(&device().on_processor(), &avatar).unwrap();
+        let (mut frames, mut views) = (Vec::new(), Vec::new());
+        for at in 0..12 {
+            let mut pose = template.skeleton.rest_pose();
+            pose.joint_rotations[0] = DQuat::from_rotation_y(f64::from(at) * 0.5) * pose.joint_rotations[0];
+            scene.pose(&avatar, &Bones::new(&template.skeleton, &pose), Some(&truth));
+            for angle in [0.0, 2.1, 4.2] {
+                let camera = camera(angle);
+                let view = scene.draw(&camera).unwrap();
+                views.push(TrainingView::cut(frames.len(), &camera, &view.rgba).unwrap());
+            }
+            frames.push(TrainingFrame { pose, translations: truth.clone() });
+        }
+        Turn { avatar, graph, normals, truth, frames, views }
+    }
+
+    fn mean_error_m(frames: &[TrainingFrame], truth: &[DVec3]) -> f64 {
+        let errors = frames.iter().flat_map(|frame| frame.translations.iter().zip(truth).map(|(a, b)| a.distance(*b)));
+        errors.sum::<f64>() / (frames.len() * truth.len()) as f64
+    }
+
+    #[test]
+    fn what_outlines_show_is_known_in_all_frames() {
+        let Turn { avatar, graph, normals, truth, mut frames, views } = turn();
+        let whole = frames.clone();
+        // Tracked where an outline runs, and on the bare body elsewhere.
+        for (at, frame) in frames.iter_mut().enumerate() {
+            let known = outlined(&whole[at], at, &views, &avatar, &graph);
+            assert!((20..150).contains(&known.iter().filter(|known| **known > 0.5).count()), "{known:?}");
+            frame.translations.iter_mut().zip(known).for_each(|(by, known)| *by *= known);
+        }
+        let before = mean_error_m(&frames, &truth);
+        let moved = remember_outlines(&mut frames, &views, &avatar, (&graph, &normals));
+        let after = mean_error_m(&frames, &truth);
+        println!("{before} to {after}, moved by {moved}");
+        assert!(before > 0.6 * OFF_M && after < 0.6 * before && moved > 0.2 * OFF_M, "{before} {after} {moved}");
+        // What is the same in all frames stays.
+        let mut same = whole.clone();
+        assert!(remember_outlines(&mut same, &views, &avatar, (&graph, &normals)) < 1e-9);
+        assert!(mean_error_m(&same, &truth) < 1e-9);
+    }
+
+    #[test]
+    fn poison_and_missing_images_move_nothing() {
+        let Turn { avatar, graph, normals, mut frames, mut views, .. } = turn();
+        frames[3].translations[7] = DVec3::NAN;
+        frames[4].translations.clear();
+        remember_outlines(&mut frames, &views, &avatar, (&graph, &normals));
+        let poisoned = frames.iter().flat_map(|frame| &frame.translations).filter(|by| !by.is_finite()).count();
+        assert_eq!((poisoned, frames[4].translations.len()), (1, 0));
+        views.clear();
+        assert!(remember_outlines(&mut frames, &views, &avatar, (&graph, &normals)) <= 0.0);
+        assert!(remember_outlines(&mut [], &views, &avatar, (&graph, &normals)) <= 0.0);
+    }
+}
