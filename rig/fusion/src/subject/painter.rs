@@ -65,7 +65,6 @@ impl GaussianPainter {
             settings: settings.appearance.mode.settings(),
             visibility: Vec::new(),
             painted: Vec::new(),
-            next: 0,
         };
         if is_avatar {
             direct.settings.corrects = true;
@@ -198,28 +197,17 @@ pub(super) struct DirectPainter {
     visibility: Vec<RenderTarget>,
     /// Views that painted in the last update, ascending.
     painted: Vec<usize>,
-    /// First view whose turn it is next.
-    next: usize,
 }
-
-/// Largest number of views that paint in one set; of more they take turns.
-const MOST_PAINTING: usize = 4;
 
 impl DirectPainter {
     fn paint(&mut self, inputs: PaintInputs<'_>, tools: &mut PaintTools<'_>) -> Result<(), FusionError> {
-        self.choose_views(inputs);
+        self.painted.clear();
+        self.painted.extend((0..inputs.views.len()).filter(|&view| inputs.geometry.is_trusted(view)));
         self.render_views(inputs, tools)?;
         self.update(inputs, tools)
     }
 
-    /// Chooses the views that paint: the trusted ones, of many those whose turn it is.
-    fn choose_views(&mut self, PaintInputs { geometry, views, .. }: PaintInputs<'_>) {
-        self.painted.clear();
-        self.painted.extend((0..views.len()).filter(|&view| geometry.is_trusted(view)));
-        take_turns(&mut self.painted, &mut self.next);
-    }
-
-    /// Renders canonical positions and the last colours into the views that paint.
+    /// Renders canonical positions and the last colours into the trusted views, which paint.
     fn render_views(&mut self, inputs: PaintInputs<'_>, tools: &mut PaintTools<'_>) -> Result<(), FusionError> {
         let PaintInputs { gpu, geometry, instants, views, .. } = inputs;
         let start = Instant::now();
@@ -252,7 +240,7 @@ impl DirectPainter {
         Ok(())
     }
 
-    /// Updates direct appearance from the views that paint.
+    /// Updates direct appearance from the trusted views.
     fn update(&mut self, inputs: PaintInputs<'_>, tools: &mut PaintTools<'_>) -> Result<(), FusionError> {
         let PaintInputs { gpu, geometry, instants, views, images } = inputs;
         let start = Instant::now();
@@ -279,17 +267,6 @@ impl DirectPainter {
 
     fn observations(&self, gpu: &GpuContext) -> Result<Observations, FusionError> {
         Ok(self.appearance.observations(gpu, self.painted.len())?)
-    }
-}
-
-/// Keeps [`MOST_PAINTING`] of these views, which are ascending: the ones from `next` on, which becomes the view after them.
-fn take_turns(views: &mut Vec<usize>, next: &mut usize) {
-    if views.len() > MOST_PAINTING {
-        let first = views.iter().position(|view| view >= next).unwrap_or(0);
-        views.rotate_left(first);
-        *next = views[MOST_PAINTING];
-        views.truncate(MOST_PAINTING);
-        views.sort_unstable();
     }
 }
 
@@ -335,26 +312,5 @@ impl LearnedPainter {
         let counts = self.networks.counts;
         stages.count("corrections that were no numbers", counts.poisoned - before.poisoned);
         Ok(())
-    }
-}
-
-#[cfg(test)]
-mod tests {
-    use super::*;
-
-    #[test]
-    fn many_views_take_turns_and_few_always_paint() {
-        let mut next = 0;
-        let mut of = |mut views: Vec<usize>| {
-            take_turns(&mut views, &mut next);
-            views
-        };
-        assert_eq!(of(vec![0, 2, 3, 5]), [0, 2, 3, 5]);
-        let six = || (0..6).collect::<Vec<_>>();
-        assert_eq!([of(six()), of(six()), of(six())], [[0, 1, 2, 3], [0, 1, 4, 5], [2, 3, 4, 5]]);
-        // The view whose turn it is, and some after it, are not trusted now.
-        assert_eq!(of(six()), [0, 1, 2, 3]);
-        assert_eq!(of(vec![0, 1, 2, 3, 5]), [0, 1, 2, 5]);
-        assert_eq!(of(Vec::new()), []);
     }
 }
