@@ -10,7 +10,7 @@ use flyrig_report::{progress_bar, stop};
 use flyrig_types::{Camera, FrameSet};
 use glam::Vec2;
 
-use crate::outline_memory::remember_outlines;
+use crate::outline_memory::{NodeSurface, remember_outlines};
 use crate::replay::{Replay, frame_number};
 
 /// Tracked take.
@@ -30,6 +30,8 @@ pub struct AvatarTake {
     pub numbers: Vec<u64>,
     /// First camera.
     pub camera: Camera,
+    /// Nodes of the deformation graph; `None` without a deformation.
+    nodes: Option<NodeSurface>,
 }
 
 impl AvatarTake {
@@ -73,15 +75,26 @@ impl AvatarTake {
         let surface = if deforms { surface.inset() } else { surface };
         let colors: Vec<[f32; 3]> = replay.session.splats(person)?.iter().map(|splat| splat.color).collect();
         let mut avatar = Avatar::new(subject.template(), &surface, deforms.then_some(&graph), &colors, order)?;
-        if deforms {
-            let moved_m = remember_outlines(&mut frames, &views, &avatar, (&graph, &surface.normals));
-            tracing::debug!(mm = 1e3 * moved_m, "nodes moved to where outlines of other frames show them");
-        }
         avatar.set_mean(frames.iter().map(|frame: &TrainingFrame| frame.translations.as_slice()));
         avatar.known_poses = KnownPoses::new(&poses);
         let camera = replay.session.rig().cameras.first().cloned().context("no camera")?;
         let undressed = (subject.body() != subject.template()).then(|| subject.body().clone());
-        Ok(Self { frames, views, avatar, undressed, uvs: surface.uvs, numbers, camera })
+        let normals = graph.node_gaussian.iter().map(|&at| surface.normals[at as usize]).collect();
+        let nodes =
+            deforms.then_some(NodeSurface { gaussians: graph.node_gaussian, neighbors: graph.neighbors, normals });
+        Ok(Self { frames, views, avatar, undressed, uvs: surface.uvs, numbers, camera, nodes })
+    }
+
+    /// Uses in all frames what outlines show of clothes and hair in some, see [`remember_outlines`]; the mean of the frames becomes the
+    /// avatar's.
+    #[must_use]
+    pub fn with_outlines(mut self) -> Self {
+        if let Some(nodes) = &self.nodes {
+            let moved_m = remember_outlines(&mut self.frames, &self.views, &self.avatar, nodes);
+            tracing::debug!(mm = 1e3 * moved_m, "nodes moved to where outlines of other frames show them");
+            self.avatar.set_mean(self.frames.iter().map(|frame| frame.translations.as_slice()));
+        }
+        self
     }
 
     /// Returns the frame of this number alone, whose shape of clothes and hair becomes the avatar's mean.

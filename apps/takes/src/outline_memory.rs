@@ -2,46 +2,61 @@
 //!
 //! A mask measures how far a surface stands off the body where the surface's outline runs. Elsewhere the tracked surface is interpolated
 //! between outlines, and a node that no outline passes lacks about the same distance in every such frame. That distance is the mean
-//! difference between its translations at outlines and away from them, along the surface's normal; it is added where no outline runs.
+//! difference between its translations at outlines and away from them, along the surface's normal. It counts less for nodes with few
+//! outlines, is averaged over neighbouring nodes, and is added as far as no outline runs.
 
 use flyrig_avatar::{Avatar, Bones, PosedAvatar, TrainingFrame};
-use flyrig_body::DeformationGraph;
 use flyrig_fit::TrainingView;
-use glam::{DVec3, Vec3, Vec4};
-use rayon::prelude::*;
+use flyrig_renderer::UNKNOWN_RGBA;
+use glam::{Vec3, Vec4};
 
 /// Standard deviation of the cosine between a surface's normal and the line of sight where its outline runs.
 const GRAZING: f32 = 0.25;
-/// Largest distance of an outline from a surface on either side, metres.
+/// Largest distance of an outline from a Gaussian on either side, metres.
 const BESIDE_M: f32 = 0.03;
 /// Frames at an outline for which a node's difference counts by half.
 const FRAMES: f64 = 2.0;
 /// Rounds of averaging over neighbouring nodes.
 const ROUNDS: usize = 2;
 
-/// Moves the graph's nodes of each frame by what they lack where no outline runs, and returns the mean movement, metres. `views` are the
-/// images of the frames with their masks, `normals` the canonical unit normals of the Gaussians that the graph was built on.
+/// Nodes of a deformation graph on a surface.
+#[derive(Debug, Clone)]
+pub struct NodeSurface {
+    /// Gaussian at each node.
+    pub gaussians: Vec<u32>,
+    /// Neighbours of each node.
+    pub neighbors: Vec<[u32; 4]>,
+    /// Canonical unit normals of the surface.
+    pub normals: Vec<Vec3>,
+}
+
+/// Moves the nodes of each frame by what they lack where no outline runs, and returns the mean movement, metres. `views` are the
+/// images of the frames with their masks.
 pub fn remember_outlines(
     frames: &mut [TrainingFrame],
     views: &[TrainingView],
     avatar: &Avatar,
-    (graph, normals): (&DeformationGraph, &[Vec3]),
+    nodes: &NodeSurface,
 ) -> f64 {
-    let normals: Vec<DVec3> = graph.node_gaussian.iter().map(|&at| normals[at as usize].as_dvec3()).collect();
-    let outlined: Vec<Vec<f64>> =
-        frames.par_iter().enumerate().map(|(at, frame)| outlined(frame, at, views, avatar, graph)).collect();
-    let mut lacking = lacking(frames, &outlined, &normals);
+    let mut posed = PosedAvatar::default();
+    let mut of_frame = |(at, frame): (usize, &TrainingFrame)| {
+        avatar.pose(&Bones::new(&avatar.template.skeleton, &frame.pose), Some(&frame.translations), &mut posed);
+        let views: Vec<&TrainingView> = views.iter().filter(|view| view.frame() == at).collect();
+        outlined(&posed, &views, nodes)
+    };
+    let outlined: Vec<Vec<f64>> = frames.iter().enumerate().map(&mut of_frame).collect();
+    let mut lacking = lacking(frames, &outlined, nodes);
     for _ in 0..ROUNDS {
-        let around = |node: usize| graph.neighbors[node].iter().map(|&other| lacking[other as usize]).sum::<f64>();
+        let around = |node: usize| nodes.neighbors[node].iter().map(|&other| lacking[other as usize]).sum::<f64>();
         lacking = (0..lacking.len()).map(|node| (lacking[node] + around(node)) / 5.0).collect();
     }
     let (mut moved, mut count) = (0.0, 0u32);
     for (frame, outlined) in frames.iter_mut().zip(&outlined) {
         for (((translation, outlined), lacking), normal) in
-            frame.translations.iter_mut().zip(outlined).zip(&lacking).zip(&normals)
+            frame.translations.iter_mut().zip(outlined).zip(&lacking).zip(&nodes.normals)
         {
             let by = (1.0 - outlined) * lacking;
-            *translation += *normal * by;
+            *translation += normal.as_dvec3() * by;
             moved += by.abs();
             count += 1;
         }
@@ -49,13 +64,14 @@ pub fn remember_outlines(
     moved / f64::from(count.max(1))
 }
 
-/// Returns how far each node stands out less where no outline runs than where one does, metres; 0 for nodes of which one is unknown.
-fn lacking(frames: &[TrainingFrame], outlined: &[Vec<f64>], normals: &[DVec3]) -> Vec<f64> {
-    let of = |(node, normal): (usize, &DVec3)| {
+/// Returns how far each node stands out less where no outline runs than where one does, metres, towards 0 for nodes with few outlines; 0
+/// where one of the two is unknown.
+fn lacking(frames: &[TrainingFrame], outlined: &[Vec<f64>], nodes: &NodeSurface) -> Vec<f64> {
+    let of = |(node, normal): (usize, &Vec3)| {
         let (mut at, mut away) = ([0.0; 2], [0.0; 2]);
         for (frame, outlined) in frames.iter().zip(outlined) {
             let Some(translation) = frame.translations.get(node).filter(|by| by.is_finite()) else { continue };
-            let (out, outlined) = (translation.dot(*normal), outlined[node]);
+            let (out, outlined) = (translation.dot(normal.as_dvec3()), outlined[node]);
             at = [at[0] + outlined * out, at[1] + outlined];
             away = [away[0] + (1.0 - outlined) * out, away[1] + 1.0 - outlined];
         }
@@ -64,27 +80,17 @@ fn lacking(frames: &[TrainingFrame], outlined: &[Vec<f64>], normals: &[DVec3]) -
         }
         (at[0] / at[1] - away[0] / away[1]) * at[1] / (at[1] + FRAMES)
     };
-    normals.iter().enumerate().map(of).collect()
+    nodes.normals.iter().enumerate().map(of).collect()
 }
 
 /// Returns how certainly an outline runs at each node in a frame, 0..=1.
-fn outlined(
-    frame: &TrainingFrame,
-    at: usize,
-    views: &[TrainingView],
-    avatar: &Avatar,
-    graph: &DeformationGraph,
-) -> Vec<f64> {
-    let mut posed = PosedAvatar::default();
-    avatar.pose(&Bones::new(&avatar.template.skeleton, &frame.pose), Some(&frame.translations), &mut posed);
+fn outlined(posed: &PosedAvatar, views: &[&TrainingView], nodes: &NodeSurface) -> Vec<f64> {
     let normals: Vec<Vec3> = posed.normals().collect();
-    let views: Vec<(&TrainingView, Vec3)> =
-        views.iter().filter(|view| view.frame() == at).map(|view| (view, view.camera().position().as_vec3())).collect();
     let of_node = |&gaussian: &u32| {
         let center = Vec4::from(posed.center[gaussian as usize]).truncate();
         let normal = normals[gaussian as usize];
-        let of_view = |(view, eye): &(&TrainingView, Vec3)| {
-            let sight = (center - *eye).normalize_or_zero();
+        let of_view = |view: &&TrainingView| {
+            let sight = (center - view.camera().position().as_vec3()).normalize_or_zero();
             let cosine = normal.dot(sight);
             let aside = (normal - sight * cosine).normalize_or_zero() * BESIDE_M;
             let ends = covered(view, center - aside) == Some(true) && covered(view, center + aside) == Some(false);
@@ -92,18 +98,18 @@ fn outlined(
         };
         views.iter().map(of_view).fold(0.0, f64::max)
     };
-    graph.node_gaussian.iter().map(of_node).collect()
+    nodes.gaussians.iter().map(of_node).collect()
 }
 
-/// Returns whether the mask covers a world point; `None` outside the image.
+/// Returns whether the mask covers a world point, or the pixel of the crop that is nearest to it: around the person, a crop has a margin
+/// without a mask. `None` behind the camera, and where another person may hide it.
 fn covered(view: &TrainingView, point: Vec3) -> Option<bool> {
-    let pixel = view.camera().project(point.as_dvec3())?.round();
+    let pixel = view.camera().project(point.as_dvec3()).filter(|pixel| pixel.is_finite())?.round();
     let [width, height] = view.size().map(f64::from);
-    if !(pixel.x >= 0.0 && pixel.y >= 0.0 && pixel.x < width && pixel.y < height) {
-        return None;
-    }
-    let index = (pixel.y * width + pixel.x) as usize;
-    view.rgba().get(4 * index + 3).map(|alpha| *alpha > 127)
+    let (column, row) = (pixel.x.clamp(0.0, width - 1.0), pixel.y.clamp(0.0, height - 1.0));
+    let first = 4 * (row * width + column) as usize;
+    let pixel = view.rgba().get(first..first + 4)?;
+    (pixel != UNKNOWN_RGBA).then_some(pixel[3] > 127)
 }
 
 #[cfg(test)]
@@ -113,7 +119,7 @@ mod tests {
     use flyrig_gpu::testing::device;
     use flyrig_renderer::HarmonicOrder;
     use flyrig_types::{Camera, Intrinsics, Isometry, Lens};
-    use glam::{DQuat, DVec2};
+    use glam::{DQuat, DVec2, DVec3};
 
     use super::*;
 
@@ -142,8 +148,7 @@ mod tests {
 
     struct Turn {
         avatar: Avatar,
-        graph: DeformationGraph,
-        normals: Vec<Vec3>,
+        nodes: NodeSurface,
         truth: Vec<DVec3>,
         frames: Vec<TrainingFrame>,
         views: Vec<TrainingView>,
@@ -155,8 +160,9 @@ mod tests {
         let surface = sample_surface(&template, 4000, 1).unwrap();
         let graph = build_graph(&template, &surface, 200, DEFAULT_SIGMA2_M2).unwrap();
         let avatar = Avatar::new(&template, &surface, Some(&graph), &[[0.5; 3]; 4000], HarmonicOrder::Zero).unwrap();
-        let normals = surface.normals.clone();
-        let truth: Vec<DVec3> = graph.node_gaussian.iter().map(|&at| normals[at as usize].as_dvec3() * OFF_M).collect();
+        let normals: Vec<Vec3> = graph.node_gaussian.iter().map(|&at| surface.normals[at as usize]).collect();
+        let truth: Vec<DVec3> = normals.iter().map(|normal| normal.as_dvec3() * OFF_M).collect();
+        let nodes = NodeSurface { gaussians: graph.node_gaussian, neighbors: graph.neighbors, normals };
         let mut scene = AvatarScene::new(&device().on_processor(), &avatar).unwrap();
         let (mut frames, mut views) = (Vec::new(), Vec::new());
         for at in 0..12 {
@@ -170,7 +176,20 @@ mod tests {
             }
             frames.push(TrainingFrame { pose, translations: truth.clone() });
         }
-        Turn { avatar, graph, normals, truth, frames, views }
+        Turn { avatar, nodes, truth, frames, views }
+    }
+
+    /// Returns how certainly outlines run at the nodes in a frame of the truth.
+    fn outlined_at(turn: &Turn, at: usize, views: &[TrainingView]) -> Vec<f64> {
+        let mut posed = PosedAvatar::default();
+        let bones = Bones::new(&turn.avatar.template.skeleton, &turn.frames[at].pose);
+        turn.avatar.pose(&bones, Some(&turn.truth), &mut posed);
+        let views: Vec<&TrainingView> = views.iter().filter(|view| view.frame() == at).collect();
+        outlined(&posed, &views, &turn.nodes)
+    }
+
+    fn certain(known: &[f64]) -> usize {
+        known.iter().filter(|known| **known > 0.5).count()
     }
 
     fn mean_error_m(frames: &[TrainingFrame], truth: &[DVec3]) -> f64 {
@@ -180,35 +199,48 @@ mod tests {
 
     #[test]
     fn what_outlines_show_is_known_in_all_frames() {
-        let Turn { avatar, graph, normals, truth, mut frames, views } = turn();
-        let whole = frames.clone();
+        let turn = turn();
+        let Turn { avatar, nodes, truth, views, .. } = &turn;
         // Tracked where an outline runs, and on the bare body elsewhere.
+        let mut frames = turn.frames.clone();
         for (at, frame) in frames.iter_mut().enumerate() {
-            let known = outlined(&whole[at], at, &views, &avatar, &graph);
-            assert!((20..150).contains(&known.iter().filter(|known| **known > 0.5).count()), "{known:?}");
+            let known = outlined_at(&turn, at, views);
+            assert!((20..150).contains(&certain(&known)), "{known:?}");
             frame.translations.iter_mut().zip(known).for_each(|(by, known)| *by *= known);
         }
-        let before = mean_error_m(&frames, &truth);
-        let moved = remember_outlines(&mut frames, &views, &avatar, (&graph, &normals));
-        let after = mean_error_m(&frames, &truth);
-        println!("{before} to {after}, moved by {moved}");
+        let before = mean_error_m(&frames, truth);
+        let moved = remember_outlines(&mut frames, views, avatar, nodes);
+        let after = mean_error_m(&frames, truth);
         assert!(before > 0.6 * OFF_M && after < 0.6 * before && moved > 0.2 * OFF_M, "{before} {after} {moved}");
         // What is the same in all frames stays.
-        let mut same = whole.clone();
-        assert!(remember_outlines(&mut same, &views, &avatar, (&graph, &normals)) < 1e-9);
-        assert!(mean_error_m(&same, &truth) < 1e-9);
+        let mut same = turn.frames.clone();
+        assert!(remember_outlines(&mut same, views, avatar, nodes) < 1e-9);
+        assert!(mean_error_m(&same, truth) < 1e-9);
+    }
+
+    #[test]
+    fn another_person_in_front_is_no_outline() {
+        let turn = turn();
+        let seen = certain(&outlined_at(&turn, 0, &turn.views));
+        // Somebody hides all that is not this person.
+        let hidden = turn.views.iter().map(|view| {
+            let hide = |pixel: &[u8]| if pixel[3] > 127 { [0, 0, 0, 255] } else { UNKNOWN_RGBA };
+            let rgba: Vec<u8> = view.rgba().chunks_exact(4).flat_map(hide).collect();
+            TrainingView::cut(view.frame(), view.camera(), &rgba).unwrap()
+        });
+        assert!(seen > 20 && certain(&outlined_at(&turn, 0, &hidden.collect::<Vec<_>>())) == 0);
     }
 
     #[test]
     fn poison_and_missing_images_move_nothing() {
-        let Turn { avatar, graph, normals, mut frames, mut views, .. } = turn();
+        let Turn { avatar, nodes, mut frames, mut views, .. } = turn();
         frames[3].translations[7] = DVec3::NAN;
         frames[4].translations.clear();
-        remember_outlines(&mut frames, &views, &avatar, (&graph, &normals));
+        assert!(remember_outlines(&mut frames, &views, &avatar, &nodes) < 1e-9);
         let poisoned = frames.iter().flat_map(|frame| &frame.translations).filter(|by| !by.is_finite()).count();
         assert_eq!((poisoned, frames[4].translations.len()), (1, 0));
         views.clear();
-        assert!(remember_outlines(&mut frames, &views, &avatar, (&graph, &normals)) <= 0.0);
-        assert!(remember_outlines(&mut [], &views, &avatar, (&graph, &normals)) <= 0.0);
+        assert!(remember_outlines(&mut frames, &views, &avatar, &nodes) <= 0.0);
+        assert!(remember_outlines(&mut [], &views, &avatar, &nodes) <= 0.0);
     }
 }

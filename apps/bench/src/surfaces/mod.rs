@@ -90,6 +90,8 @@ struct Cost {
 struct Subject {
     name: String,
     take: AvatarTake,
+    /// The take without what outlines of other frames show.
+    tracked: AvatarTake,
     truths: Vec<(u64, TrueSurface)>,
     inputs: Vec<Camera>,
 }
@@ -147,7 +149,7 @@ fn score_take(
     }
     if !args.brief {
         let (number, truth) = subject.truths.first().context("no frame is scored")?;
-        let instant = fit(args, subject.take.clone().only(*number)?, gpu)?;
+        let instant = fit(args, subject.tracked.clone().only(*number)?, gpu)?;
         for (avatar, surface) in [
             (&fitted, format!("Eq. 18, frame {number}")),
             (&instant, format!("fitted to frame {number} alone, frame {number}")),
@@ -212,7 +214,8 @@ fn track(
     .with_context(|| format!("no surface of {}", settings.dataset.display()))?;
     ensure!(!stop::requested(), STOPPED);
     ensure!(!truths.is_empty(), "{name}: the person was found in none of the frames {:?}", args.scored);
-    Ok((Subject { name: name.to_owned(), take, truths, inputs }, scores))
+    let tracked = take.clone();
+    Ok((Subject { name: name.to_owned(), take: take.with_outlines(), tracked, truths, inputs }, scores))
 }
 
 /// Fits the avatar of a take to its images.

@@ -105,7 +105,7 @@ impl Source {
                 found.retain(|(number, _)| *number == frame);
                 take.only(frame)?
             }
-            None => take,
+            None => take.with_outlines(),
         };
         let photos = take.views.clone();
         let AvatarTake { frames, views, avatar, undressed, numbers, .. } = take;

@@ -193,32 +193,30 @@ impl GaussianPainter {
 pub(super) struct DirectPainter {
     appearance: DirectAppearance,
     settings: AppearanceSettings,
-    /// One target for each view that paints, remade when an image has another size.
+    /// One target per input view; grows with the rig, and is remade when an image's size changes.
     visibility: Vec<RenderTarget>,
-    /// Views that painted in the last update, ascending.
+    /// Views that painted in the last update.
     painted: Vec<usize>,
 }
 
 impl DirectPainter {
     fn paint(&mut self, inputs: PaintInputs<'_>, tools: &mut PaintTools<'_>) -> Result<(), FusionError> {
         self.painted.clear();
-        self.painted.extend((0..inputs.views.len()).filter(|&view| inputs.geometry.is_trusted(view)));
         self.render_views(inputs, tools)?;
         self.update(inputs, tools)
     }
 
-    /// Renders canonical positions and the last colours into the trusted views, which paint.
+    /// Renders canonical positions and the last colours into every view.
     fn render_views(&mut self, inputs: PaintInputs<'_>, tools: &mut PaintTools<'_>) -> Result<(), FusionError> {
         let PaintInputs { gpu, geometry, instants, views, .. } = inputs;
         let start = Instant::now();
         let settings = RasterSettings { outputs: Outputs::SURFACE, ..RasterSettings::default() };
-        for at in 0..self.painted.len() {
-            let view = &views[self.painted[at]];
-            self.fit_target(gpu, at, (view.image.width(), view.image.height()))?;
+        for (i, view) in views.iter().enumerate() {
+            self.fit_target(gpu, i, (view.image.width(), view.image.height()))?;
             let mut encoder = gpu.device.create_command_encoder(&Default::default());
-            let gaussians = geometry.drawn(instants.of_view(self.painted[at]));
-            tools.rasterizer.encode(gpu, &mut encoder, gaussians, view.camera, &settings, &self.visibility[at])?;
-            if at + 1 == self.painted.len() {
+            let gaussians = geometry.drawn(instants.of_view(i));
+            tools.rasterizer.encode(gpu, &mut encoder, gaussians, view.camera, &settings, &self.visibility[i])?;
+            if i + 1 == views.len() {
                 tools.clock.mark(&mut encoder, TimedStage::Visibility);
             }
             gpu.queue.submit([encoder.finish()]);
@@ -226,14 +224,14 @@ impl DirectPainter {
         tools.clock.wait(gpu, TimedStage::Visibility, start, tools.stages)
     }
 
-    /// Gives the view that paints as number `at` a target of its image's size.
-    fn fit_target(&mut self, gpu: &GpuContext, at: usize, (width, height): (u32, u32)) -> Result<(), FusionError> {
-        if self.visibility.get(at).is_some_and(|target| (target.width, target.height) == (width, height)) {
+    /// Gives a view a target of its image's size.
+    fn fit_target(&mut self, gpu: &GpuContext, view: usize, (width, height): (u32, u32)) -> Result<(), FusionError> {
+        if self.visibility.get(view).is_some_and(|target| (target.width, target.height) == (width, height)) {
             return Ok(());
         }
         let target = RenderTarget::new(gpu, width, height)?;
-        if at < self.visibility.len() {
-            self.visibility[at] = target;
+        if view < self.visibility.len() {
+            self.visibility[view] = target;
         } else {
             self.visibility.push(target);
         }
@@ -244,17 +242,18 @@ impl DirectPainter {
     fn update(&mut self, inputs: PaintInputs<'_>, tools: &mut PaintTools<'_>) -> Result<(), FusionError> {
         let PaintInputs { gpu, geometry, instants, views, images } = inputs;
         let start = Instant::now();
-        let observing: Vec<ViewInput<'_>> = (self.painted.iter().zip(&self.visibility))
-            .map(|(&i, visibility)| ViewInput {
+        self.painted.extend((0..views.len()).filter(|&i| geometry.is_trusted(i)));
+        let observing: Vec<ViewInput<'_>> = (self.painted.iter())
+            .map(|&i| ViewInput {
                 camera: views[i].camera,
                 picture: &images.images()[i].words,
-                canonical: &visibility.canonical,
-                rendered: &visibility.color,
+                canonical: &self.visibility[i].canonical,
+                rendered: &self.visibility[i].color,
                 gaussians: (instants.of_view(i) > 0).then(|| geometry.at(instants.of_view(i))),
             })
             .collect();
         let mut encoder = gpu.device.create_command_encoder(&Default::default());
-        if self.painted.is_empty() {
+        if views.is_empty() {
             tools.clock.mark(&mut encoder, TimedStage::Visibility);
         }
         self.appearance.update(gpu, &mut encoder, geometry.painted(), &observing, &self.settings)?;

@@ -69,7 +69,7 @@ pub(super) struct PersonShape {
     pub template: Template,
     /// Body below the clothes, and the clothes; `None` without any.
     undressed: Option<(Template, Outfit)>,
-    /// Template of the person stream, for viewers that draw the person themselves; `None` until [`Subject::prepare_stream`].
+    /// Template of the person stream, for viewers that draw the person themselves; `None` until it is encoded.
     pub stream: Option<Arc<EncodedTemplate>>,
 }
 
@@ -154,7 +154,7 @@ impl Subject {
         Ok(subject)
     }
 
-    /// Creates a person without clothes of a surface of their own, with this surface and without a template of the person stream.
+    /// Creates a person of this template and its surface, without a template of the person stream.
     pub(crate) fn of_surface(
         gpu: &GpuContext,
         id: PersonId,
