@@ -85,7 +85,7 @@ impl AvatarTake {
         Ok(Self { frames, views, avatar, undressed, uvs: surface.uvs, numbers, camera, nodes })
     }
 
-    /// Uses in all frames what outlines show of clothes and hair in some, see [`remember_outlines`]; the mean of the frames becomes the
+    /// Uses in all frames what outlines show of clothes and hair in some; the mean of the frames becomes the
     /// avatar's.
     #[must_use]
     pub fn with_outlines(mut self) -> Self {
