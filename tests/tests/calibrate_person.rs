@@ -12,6 +12,7 @@ const SIM: &str = "seed = 511\nwidth = 256\nheight = 256\n[motion]\nkind = \"wal
                    [[sensors]]\n[[sensors]]\n";
 
 #[test]
+#[ignore = "minutes: run by make test-long"]
 fn a_walking_person_corrects_the_calibration() {
     let folder = tempfile::tempdir().unwrap();
     let command = |text: &str| run(PROGRAM, &text.split(' ').collect::<Vec<_>>(), folder.path()).unwrap();

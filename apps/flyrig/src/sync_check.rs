@@ -256,6 +256,7 @@ mod tests {
     }
 
     #[test]
+    #[ignore = "minutes: run by make test-long"]
     fn random_lags_of_a_person_who_waves_are_found_by_motion() {
         let gpu = GpuContext::new(&AdapterChoice::Best).unwrap();
         for (off, _) in Lagging::new(&gpu, 1, MotionKind::Wave, 128, 240).by_motion() {

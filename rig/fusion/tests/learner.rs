@@ -155,6 +155,7 @@ fn a_learnt_person_is_seen_better_by_another_camera_and_reruns_are_identical() {
 }
 
 #[test]
+#[ignore = "minutes: run by make test-long"]
 fn other_clothes_are_noticed_and_learnt_anew() {
     let (before, after) = (truth([[0.5, 0.05, 0.03], [0.05, 0.1, 0.5]]), truth([[0.02, 0.4, 0.05], [0.6, 0.5, 0.02]]));
     let mut session = session(gpu(), learning(), None);

@@ -18,6 +18,7 @@ fn scores(gpu: &GpuContext, sequence: &SimulatedSequence, per_view_time: bool, s
 
 /// Tests a full turn in two seconds; each camera exposes at some time within the frame period after the instant.
 #[test]
+#[ignore = "minutes: run by make test-long"]
 fn a_rig_without_genlock_loses_little_with_the_time_of_each_view() {
     let gpu = GpuContext::new(&AdapterChoice::Best).unwrap();
     let config = SequenceConfig { motion: SequenceMotion::Turn, seed: 1, side: SIDE, frames: 10, fps: 30.0 };

@@ -94,6 +94,7 @@ fn somebody_of_another_build_gets_another_shape_and_who_comes_back_keeps_it() {
 }
 
 #[test]
+#[ignore = "minutes: run by make test-long"]
 fn a_body_that_does_not_fit_is_measured_again_on_request() {
     let gpu = GpuContext::new(&AdapterChoice::Best).unwrap();
     let mut simulator = simulator(&gpu, Build::SlimWoman);
