@@ -20,6 +20,7 @@ fn eval(data: &Dataset, inputs: &str, [mode, solver]: [&str; 2]) -> serde_json::
 }
 
 #[test]
+#[ignore = "minutes: run by make test-long"]
 fn held_out_views_are_predicted_and_no_part_of_the_method_loses() {
     let people = SEEDS.map(|seed| write_dataset_of(seed).unwrap());
     // One view, which leaves most of the person unseen, and three views.

@@ -132,6 +132,7 @@ fn hands_and_face_are_found_in_images_alone() {
 }
 
 #[test]
+#[ignore = "minutes: run by make test-long"]
 fn shoes_and_a_skirt_are_found_and_drawn_and_trousers_are_no_skirt() {
     let folder = tempfile::tempdir().unwrap();
     let command = |args: &[&str]| run(PROGRAM, args, folder.path()).unwrap();
