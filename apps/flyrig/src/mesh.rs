@@ -39,8 +39,7 @@ pub fn mesh(args: &MeshArgs, gpu: &dyn Fn() -> Result<GpuContext>) -> Result<()>
     splats::check_no_splats(args)?;
     let mut source = Source::open(args, gpu)?;
     let started = Instant::now();
-    let undressed = source.undressed.as_ref();
-    let options = PersonOptions { mesh, triangles: args.triangles as usize, texture_side: args.texture, undressed };
+    let options = PersonOptions { mesh, triangles: args.triangles as usize, texture_side: args.texture };
     let (mut person, report) = MeshedPerson::of_avatar(&source.avatar, &options)
         .with_context(|| format!("no mesh of {}", args.take.dataset.display()))?;
     let photos = texture::photograph(&mut person, &source, args.light)?;

@@ -2,7 +2,6 @@
 
 use anyhow::{Context as _, Result, bail};
 use flyrig_avatar::{Avatar, KnownPoses, TrainingFrame};
-use flyrig_body::Template;
 use flyrig_fit::TrainingView;
 use flyrig_fusion::{BodySettings, Outcome, PersonId, person_surface};
 use flyrig_renderer::HarmonicOrder;
@@ -22,8 +21,6 @@ pub struct AvatarTake {
     pub views: Vec<TrainingView>,
     /// Initial avatar, which looks like the live rendering.
     pub avatar: Avatar,
-    /// Its body without clothes; `None` for one that wears none of its own surface.
-    pub undressed: Option<Template>,
     /// Texture coordinates of its Gaussians; empty if the template has none.
     pub uvs: Vec<Vec2>,
     /// Number of each of these frames, ascending; at least one.
@@ -77,12 +74,12 @@ impl AvatarTake {
         let mut avatar = Avatar::new(subject.template(), &surface, deforms.then_some(&graph), &colors, order)?;
         avatar.set_mean(frames.iter().map(|frame: &TrainingFrame| frame.translations.as_slice()));
         avatar.known_poses = KnownPoses::new(&poses);
+        avatar.undressed = subject.undressed().cloned();
         let camera = replay.session.rig().cameras.first().cloned().context("no camera")?;
-        let undressed = (subject.body() != subject.template()).then(|| subject.body().clone());
         let normals = graph.node_gaussian.iter().map(|&at| surface.normals[at as usize]).collect();
         let nodes =
             deforms.then_some(NodeSurface { gaussians: graph.node_gaussian, neighbors: graph.neighbors, normals });
-        Ok(Self { frames, views, avatar, undressed, uvs: surface.uvs, numbers, camera, nodes })
+        Ok(Self { frames, views, avatar, uvs: surface.uvs, numbers, camera, nodes })
     }
 
     /// Uses in all frames what outlines show of clothes and hair in some; the mean of the frames becomes the

@@ -118,8 +118,8 @@ mod tests {
     use flyrig_body::{DEFAULT_SIGMA2_M2, ShapeParams, build_graph, default_template, sample_surface};
     use flyrig_gpu::testing::device;
     use flyrig_renderer::HarmonicOrder;
-    use flyrig_types::{Camera, Intrinsics, Isometry, Lens};
-    use glam::{DQuat, DVec2, DVec3};
+    use flyrig_types::{Camera, Intrinsics, Isometry};
+    use glam::{DQuat, DVec3};
 
     use super::*;
 
@@ -129,21 +129,9 @@ mod tests {
 
     /// Camera that looks at a body which stands at the origin with y up.
     fn camera(angle: f64) -> Camera {
-        let rotation = DQuat::from_rotation_x(std::f64::consts::PI) * DQuat::from_rotation_y(angle);
-        let place = rotation.inverse() * DVec3::new(0.0, 0.0, -2.6) + DVec3::Y * 0.9;
-        Camera {
-            id: "view".into(),
-            intrinsics: Intrinsics {
-                width: SIZE,
-                height: SIZE,
-                focal_px: DVec2::splat(190.0),
-                center_px: DVec2::splat(f64::from(SIZE) / 2.0),
-                lens: Lens::PINHOLE,
-            },
-            camera_from_world: Isometry { rotation, translation: -(rotation * place) },
-            time_offset_nanos: 0,
-            color: Default::default(),
-        }
+        let center = DVec3::Y * 0.9;
+        let eye = center + DQuat::from_rotation_y(-angle) * (DVec3::Z * 2.6);
+        Camera::new("view", Intrinsics::pinhole(SIZE, SIZE, 190.0), Isometry::look_at(eye, center, DVec3::Y))
     }
 
     struct Turn {

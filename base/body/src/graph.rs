@@ -2,7 +2,6 @@
 
 use std::cmp::Reverse;
 use std::collections::BinaryHeap;
-use std::collections::binary_heap::PeekMut;
 
 use flyrig_model::stretch::growth;
 use glam::{DVec3, Vec3};
@@ -118,8 +117,11 @@ pub fn displacement(rest: &[Vec3], translations: &[DVec3], nodes: [u32; 4], weig
 /// node.
 const LEAST_WEIGHT: f32 = 0.5 / 255.0;
 
-/// Width of a bucket of the search, metres along the surface.
+/// Width of a bucket of the searches, metres along the surface.
 const BUCKET_M: f32 = 5e-4;
+
+/// Distance from which on the farthest points share a bucket, metres.
+const FARTHEST_M: f32 = 2.0;
 
 /// Marker of a missing node.
 const NONE: u32 = u32::MAX;
@@ -146,21 +148,22 @@ fn hang(point: Vec3, nearest: &[u32; NEAREST + 1], nodes: &[Vec3], sigma2_m2: f6
 /// Selects points by farthest-point sampling along the surface. Each component gets its first node before any gets a second.
 fn farthest_points(links: &SurfaceLinks, count: usize, nodes: usize) -> Vec<u32> {
     let mut distance = vec![f32::INFINITY; count];
-    // Distances are not negative, so that their bits have their order; they only fall: an outdated entry sinks to its place. Lower
-    // indices first.
-    let unreached = f32::INFINITY.to_bits();
-    let mut farthest: BinaryHeap<(u32, Reverse<u32>)> = (0..count as u32).map(|i| (unreached, Reverse(i))).collect();
+    // Far ones first, of those as far the lower index. Distances only fall: an outdated entry sinks to its place.
+    let entry = |distance: f32, gaussian: u32| (u32::MAX - distance.to_bits(), gaussian);
+    let mut farthest = MonotoneQueue::new(|(far, _): &(u32, u32)| {
+        ((FARTHEST_M - f32::from_bits(u32::MAX - far)) / BUCKET_M).max(0.0) as usize
+    });
+    (0..count as u32).for_each(|i| farthest.push(entry(f32::INFINITY, i)));
     let mut chosen = Vec::with_capacity(nodes);
     let mut front = BinaryHeap::new();
     while chosen.len() < nodes {
-        let Some(mut first) = farthest.peek_mut() else { break };
-        let gaussian = first.1.0;
-        let now = distance[gaussian as usize].to_bits();
-        if now < first.0 {
-            first.0 = now;
+        let Some(first) = farthest.pop() else { break };
+        let gaussian = first.1;
+        let now = entry(distance[gaussian as usize], gaussian);
+        if now > first {
+            farthest.push(now);
             continue;
         }
-        PeekMut::pop(first);
         chosen.push(gaussian);
         distance[gaussian as usize] = 0.0;
         front.push(Reverse((0, gaussian)));

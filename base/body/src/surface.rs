@@ -18,10 +18,10 @@ const MAX_GAUSSIANS: usize = 10_000_000;
 /// Random candidates per Gaussian; more make the spacing evener and take longer.
 const CANDIDATES_PER_GAUSSIAN: usize = 4;
 
-/// Standard deviation of a Gaussian over the distance to its nearest neighbour: 0.75 of the mean spacing (FlyHuman,
-/// section 3.1), which blue noise puts at 1.3 times the nearest distance. Smaller ones let the back of the body
-/// show through: at 0.75 of the nearest distance the front's alpha is 0.98, here 0.999.
-const SCALE_OF_NEAREST: f32 = 0.975;
+/// Standard deviation of a Gaussian over the distance to its nearest neighbour: 0.69 of the mean spacing, which blue noise puts at 1.3
+/// times the nearest distance. Larger ones blur the images, such as 0.75 of the mean spacing (FlyHuman, section 3.1): d1 loses 0.15 dB.
+/// Much smaller ones let the back of the body show through: at 0.75 of the nearest distance the front's alpha is 0.98.
+const SCALE_OF_NEAREST: f32 = 0.9;
 
 /// Gaussians on the canonical surface; all lists have the same length.
 #[derive(Debug, Clone, PartialEq)]
@@ -36,7 +36,7 @@ pub struct SurfaceGaussians {
     pub parts: Vec<Part>,
     /// Skin weights, interpolated, the strongest four.
     pub skin: Vec<SkinWeights>,
-    /// Standard deviation, metres: 0.975 of the distance to the nearest neighbour on the same side of the body.
+    /// Standard deviation, metres: 0.9 of the distance to the nearest neighbour on the same side of the body.
     pub scale_m: Vec<f32>,
     /// Depth of the centre below the rendered surface, along the normal, metres; 0 as sampled ([`Self::inset`]).
     pub depth_m: Vec<f32>,

@@ -9,8 +9,8 @@ use flyrig_body::{DEFAULT_SIGMA2_M2, ShapeParams, build_graph, default_template,
 use flyrig_fit::{Fit, FitSettings, TrainingView};
 use flyrig_gpu::{GpuContext, testing::on_both};
 use flyrig_renderer::HarmonicOrder;
-use flyrig_types::{Camera, Intrinsics, Isometry, Lens, Pose};
-use glam::{DQuat, DVec2, DVec3};
+use flyrig_types::{Camera, Intrinsics, Isometry, Pose};
+use glam::{DQuat, DVec3};
 
 const SIZE: u32 = 96;
 
@@ -24,21 +24,9 @@ fn avatar(color: impl Fn(usize) -> [f32; 3], gaussians: usize) -> Avatar {
 
 /// Around a body that stands at the origin with y up.
 fn camera(angle: f64) -> Camera {
-    let rotation = DQuat::from_rotation_x(std::f64::consts::PI) * DQuat::from_rotation_y(angle);
-    let place = rotation.inverse() * DVec3::new(0.0, 0.0, -2.6) + DVec3::Y * 0.9;
-    Camera {
-        id: "view".into(),
-        intrinsics: Intrinsics {
-            width: SIZE,
-            height: SIZE,
-            focal_px: DVec2::splat(110.0),
-            center_px: DVec2::splat(f64::from(SIZE) / 2.0),
-            lens: Lens::PINHOLE,
-        },
-        camera_from_world: Isometry { rotation, translation: -(rotation * place) },
-        time_offset_nanos: 0,
-        color: Default::default(),
-    }
+    let center = DVec3::Y * 0.9;
+    let eye = center + DQuat::from_rotation_y(-angle) * (DVec3::Z * 2.6);
+    Camera::new("view", Intrinsics::pinhole(SIZE, SIZE, 110.0), Isometry::look_at(eye, center, DVec3::Y))
 }
 
 /// Frames and images of an avatar.

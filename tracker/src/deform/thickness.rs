@@ -4,7 +4,7 @@ use glam::DVec3;
 
 use crate::deform::normal::NormalMatrix;
 
-/// Weight of the mean thickness of all parts, as a share of all weights: a part that is hardly seen resembles the others.
+/// Weight of the mean thickness of all parts but loose ones, as a share of all weights: a part that is hardly seen resembles the others.
 const LEAST_SHARE: f64 = 0.01;
 /// Share of a frame set in the known thickness, after the first.
 const RATE: f64 = 0.5;
@@ -13,7 +13,7 @@ const RATE: f64 = 0.5;
 /// there, so that the unseen side of a sleeve is not dragged along by the seen one but follows it outwards.
 #[derive(Debug)]
 pub(super) struct Thickness {
-    /// Canonical normals of the nodes, and their parts.
+    /// Canonical normals of the nodes, and their parts: odd for those of loose clothes.
     normals: Vec<DVec3>,
     parts: Vec<usize>,
     /// Plausible range, metres.
@@ -23,8 +23,9 @@ pub(super) struct Thickness {
 }
 
 impl Thickness {
-    /// Creates an unknown thickness from one normal and one part per node.
-    pub(super) fn new(normals: Vec<DVec3>, parts: Vec<usize>, range_m: [f64; 2]) -> Self {
+    /// Creates an unknown thickness from one normal and one part per node, and whether it belongs to loose clothes.
+    pub(super) fn new(normals: Vec<DVec3>, parts: impl Iterator<Item = (usize, bool)>, range_m: [f64; 2]) -> Self {
+        let parts = parts.map(|(part, is_loose)| 2 * part + usize::from(is_loose)).collect();
         Self { normals, parts, range_m, known: None }
     }
 
@@ -52,12 +53,14 @@ impl Thickness {
                 *sum += weight * along;
             }
         }
-        let (all_weights, all) = sums.iter().fold((0.0, 0.0), |(w, s), part| (w + part.0, s + part.1));
+        let all_weights: f64 = sums.iter().map(|(weights, _)| weights).sum();
         if all_weights <= 0.0 {
             return;
         }
+        let (tight_weights, tight) = sums.iter().step_by(2).fold((0.0, 0.0), |(w, s), part| (w + part.0, s + part.1));
         let least = LEAST_SHARE * all_weights;
-        let now = sums.iter().map(|(weights, sum)| (sum + least * all / all_weights) / (weights + least));
+        let usual = if tight_weights > 0.0 { least * tight / tight_weights } else { 0.0 };
+        let now = sums.iter().map(|(weights, sum)| (sum + usual) / (weights + least));
         self.known = Some(match self.known.take() {
             None => now.collect(),
             Some(known) => known.into_iter().zip(now).map(|(known, now)| known + (now - known) * RATE).collect(),

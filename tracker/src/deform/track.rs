@@ -144,18 +144,19 @@ impl DeformTracker {
     }
 
     /// Estimates the thickness of clothes on each part where images constrain it, and applies it where they do not. Takes
-    /// one canonical unit normal and one part number per node. Gradient descent ignores it.
+    /// one canonical unit normal and one part number per node, and whether the node belongs to loose clothes, such as a skirt around the legs:
+    /// those of a part are as thick as each other, and say nothing about the rest of it. Gradient descent ignores the thickness.
     ///
     /// # Errors
     /// [`TrackErrorKind::Template`] unless there are one finite normal and one part per node.
-    pub fn with_thickness(mut self, normals: Vec<DVec3>, parts: Vec<usize>) -> Result<Self, TrackError> {
+    pub fn with_thickness(mut self, normals: Vec<DVec3>, parts: &[(usize, bool)]) -> Result<Self, TrackError> {
         let nodes = self.translations.len();
         if normals.len() != nodes || parts.len() != nodes || !normals.iter().all(|n| n.is_finite()) {
             let message = format!("{} finite normals and {} parts for {nodes} nodes", normals.len(), parts.len());
             return Err(TrackError::new(TrackErrorKind::Template, message));
         }
         if matches!(self.settings.solver, DeformSolver::GaussNewton { .. }) {
-            self.thickness = Some(Thickness::new(normals, parts, self.settings.thickness_m));
+            self.thickness = Some(Thickness::new(normals, parts.iter().copied(), self.settings.thickness_m));
         }
         Ok(self)
     }

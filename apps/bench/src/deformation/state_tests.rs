@@ -78,7 +78,7 @@ fn filled(value: u8) -> Mask {
 fn the_tracking_degrades_and_comes_back_by_itself() {
     let gpu = GpuContext::new(&AdapterChoice::Best).unwrap();
     let config = SequenceConfig { motion: SequenceMotion::Turn, seed: 2, side: SIDE, frames: 34, fps: 30.0 };
-    let sequence = SimulatedSequence::simulate(&gpu, config).unwrap();
+    let sequence = SimulatedSequence::simulate_inputs(&gpu, config, 3).unwrap();
     let mut calm = Stage::new(&gpu, &sequence);
     calm.play(0..34, 0, as_is);
     let goal = calm.quality();

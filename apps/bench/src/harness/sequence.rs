@@ -70,6 +70,16 @@ impl SimulatedSequence {
     /// Renders the sequence with input camera `i` (in order of use) exposing `shifts[i]` nanoseconds after the instant, as its
     /// timestamps say.
     pub fn simulate_shifted(gpu: &GpuContext, config: SequenceConfig, shifts: &[i64]) -> Result<Self> {
+        Self::simulate_cameras(gpu, config, shifts, &[INPUTS.as_slice(), &HELD_OUT].concat())
+    }
+
+    /// Renders the images of the first `views` input cameras, and none of the cameras that are held out.
+    #[cfg(test)]
+    pub fn simulate_inputs(gpu: &GpuContext, config: SequenceConfig, views: usize) -> Result<Self> {
+        Self::simulate_cameras(gpu, config, &[], &INPUTS[..views])
+    }
+
+    fn simulate_cameras(gpu: &GpuContext, config: SequenceConfig, shifts: &[i64], slots: &[usize]) -> Result<Self> {
         let turn_secs = (config.frames as f64 / config.fps * 6.0).clamp(2.0, 60.0);
         let mut simulator = Simulator::new(
             gpu,
@@ -91,7 +101,7 @@ impl SimulatedSequence {
         for index in 0..config.frames as u64 {
             let nanos = simulator.frame_nanos(index);
             let mut row: Vec<Option<Arc<Frame>>> = rig.cameras.iter().map(|_| None).collect();
-            for slot in INPUTS.into_iter().chain(HELD_OUT) {
+            for &slot in slots {
                 let shift = INPUTS.iter().position(|&s| s == slot).and_then(|i| shifts.get(i)).copied().unwrap_or(0);
                 let capture_nanos = nanos.saturating_add(shift);
                 let (image, mask) = simulator.capture(capture_nanos, slot)?;

@@ -241,8 +241,7 @@ fn meshed(
     truths: &[(u64, TrueSurface)],
 ) -> Result<(Row, f32)> {
     let started = Instant::now();
-    let undressed = subject.take.undressed.as_ref();
-    let options = PersonOptions { mesh, triangles: args.triangles as usize, undressed, ..PersonOptions::default() };
+    let options = PersonOptions { mesh, triangles: args.triangles as usize, ..PersonOptions::default() };
     let (person, report) =
         MeshedPerson::of_avatar(avatar, &options).with_context(|| format!("no mesh of {}", subject.name))?;
     let mesh_secs = started.elapsed().as_secs_f64();

@@ -253,7 +253,8 @@ impl<'a> Building<'a> {
             masks: format!("{:?}", take.perception.settings.masks).to_lowercase(),
             steps: self.course.done(),
             seed: self.args.seed,
-            training_db,
+            // So few digits are the same number after they were read as JSON.
+            training_db: (training_db * 1e3).round() / 1e3,
             edits: Vec::new(),
         }
     }

@@ -4,7 +4,6 @@ use std::time::Instant;
 
 use anyhow::{Context as _, Result, ensure};
 use flyrig_avatar::{Avatar, AvatarFitSettings, AvatarModel, TrainingFrame};
-use flyrig_body::Template;
 use flyrig_fit::{Fit, FitSettings, TrainingView};
 use flyrig_fusion::BodySettings;
 use flyrig_gpu::GpuContext;
@@ -20,8 +19,6 @@ use crate::avatar::{DrivenMotion, load, open_replay};
 /// Avatar, and the frames of its take.
 pub(super) struct Source {
     pub avatar: Avatar,
-    /// Body of the take's person without clothes that have a surface of their own, where it wears some.
-    pub undressed: Option<Template>,
     /// Frames in which the person was found; none for an avatar from a file.
     pub frames: Vec<TrainingFrame>,
     /// Number of each of these frames in the take, ascending.
@@ -52,7 +49,6 @@ impl Source {
                 args.motion.as_deref().map(|motion| DrivenMotion::load(&avatar.surface(), motion)).transpose()?;
             return Ok(Self {
                 avatar,
-                undressed: None,
                 motion: motion.map(|motion| motion.track().clone()),
                 frames: Vec::new(),
                 numbers: Vec::new(),
@@ -108,7 +104,7 @@ impl Source {
             None => take.with_outlines(),
         };
         let photos = take.views.clone();
-        let AvatarTake { frames, views, avatar, undressed, numbers, .. } = take;
+        let AvatarTake { frames, views, avatar, numbers, .. } = take;
         let tracked_s = started.elapsed().as_secs_f64();
         println!("tracked {} frames in {tracked_s:.0} s", frames.len());
         let up = replay.session.rig().world_up;
@@ -131,7 +127,6 @@ impl Source {
         let fitted_s = started.elapsed().as_secs_f64();
         Ok(Self {
             avatar,
-            undressed,
             frames,
             motion: None,
             numbers,

@@ -20,8 +20,7 @@ const CONTRAST: u8 = 16;
 /// Least distance of small Gaussians relative to that of all others, and in texels.
 const FINER: f32 = 0.2;
 const TEXELS: f32 = 0.8;
-/// Standard deviation of a small Gaussian over the distance to its nearest neighbour, as in the sampling of surfaces;
-/// thickness over standard deviation.
+/// Standard deviation of a small Gaussian over the distance to its nearest neighbour; thickness over standard deviation.
 const DEVIATION: f32 = 0.975;
 const THICKNESS: f32 = 0.5;
 /// Logit of the opacity of small Gaussians.

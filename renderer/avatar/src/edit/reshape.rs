@@ -17,6 +17,8 @@ impl Avatar {
     /// [`AvatarError::Body`] for unknown targets, weights out of range, and bodies whose shape cannot be edited.
     pub fn reshape(&mut self, change: &ShapeParams) -> Result<(), AvatarError> {
         let new = self.template.reshape(change)?;
+        let reshape = |body: &Template| body.reshape(change).map(|new| new.template);
+        let undressed = self.undressed.as_ref().map(reshape).transpose()?;
         for i in 0..self.places.len() {
             let attachment = self.attachments[i];
             let at = |template: &Template| attachment.blend(template, &template.positions);
@@ -36,6 +38,7 @@ impl Avatar {
             }
         }
         self.template = new.template;
+        self.undressed = undressed;
         Ok(())
     }
 }
@@ -78,7 +81,10 @@ fn change_of(old: &Template, new: &Template, attachment: Attachment) -> (Quat, f
 
 #[cfg(test)]
 mod tests {
-    use flyrig_body::{default_template, sample_surface};
+    use std::collections::HashSet;
+
+    use flyrig_body::{Skirt, default_template, sample_surface};
+    use flyrig_renderer::HarmonicOrder;
 
     use super::*;
     use crate::model::avatar::tests::small;
@@ -112,6 +118,26 @@ mod tests {
                 .any(|(a, b)| a.distance(*b) > 0.01)
         );
         avatar.check().unwrap();
+    }
+
+    #[test]
+    fn the_body_below_a_skirt_changes_with_it() {
+        let body = default_template(&ShapeParams::default()).unwrap();
+        let dressed = Skirt { length: 0.6, flare: 0.2 }.on(&body).unwrap();
+        let surface = sample_surface(&dressed, 500, 5).unwrap();
+        let mut avatar = Avatar::new(&dressed, &surface, None, &[], HarmonicOrder::Zero).unwrap();
+        avatar.undressed = Some(body);
+        // Vertices of the skirt are those that the body does not have.
+        let shared = |avatar: &Avatar| {
+            let bits = |place: &Vec3| place.to_array().map(f32::to_bits);
+            let own: HashSet<_> = avatar.undressed.as_ref().unwrap().positions.iter().map(bits).collect();
+            avatar.template.positions.iter().map(|place| own.contains(&bits(place))).collect::<Vec<_>>()
+        };
+        let before = shared(&avatar);
+        assert!(before.contains(&true) && before.contains(&false));
+        avatar.reshape(&ShapeParams::default().with("age", 0.1)).unwrap();
+        assert_eq!(shared(&avatar), before);
+        assert!(Avatar::from_bytes(&avatar.to_bytes().unwrap()).unwrap() == avatar);
     }
 
     #[test]

@@ -103,6 +103,8 @@ impl Attachment {
 pub struct Avatar {
     /// Body, clothes included.
     pub template: Template,
+    /// Body without the skirt or coat that has a surface of its own, in the same canonical space; `None` without one, and in files of before.
+    pub undressed: Option<Template>,
     /// Canonical positions of the Gaussians on the body, metres.
     pub places: Vec<Vec3>,
     /// Attachment to the body's surface; inset Gaussians lie below it.
@@ -154,6 +156,7 @@ impl Avatar {
         });
         Ok(Self {
             template: template.clone(),
+            undressed: None,
             places: surface.positions.clone(),
             attachments: surface
                 .triangle
@@ -206,6 +209,10 @@ impl Avatar {
     /// Checks that all lists belong together and every number is finite.
     pub(crate) fn check(&self) -> Result<(), String> {
         self.template.check().map_err(|error| error.to_string())?;
+        if let Some(body) = &self.undressed {
+            let checked = body.check().and_then(|()| self.template.check_same_joints(body));
+            checked.map_err(|error| format!("the body below its clothes does not fit: {error}"))?;
+        }
         let count = self.places.len();
         if count == 0 || self.skin.len() != count || self.parameters.len() != count {
             return Err(format!("lists of {count}, {} and {} Gaussians", self.skin.len(), self.parameters.len()));
@@ -282,6 +289,9 @@ pub(crate) mod tests {
             changed.check().unwrap_err()
         };
         assert!(with(&|avatar| avatar.skin.truncate(9)).contains("lists of"));
+        let bodiless =
+            |avatar: &mut Avatar| avatar.undressed = Some(Template { skin: Vec::new(), ..avatar.template.clone() });
+        assert!(with(&bodiless).contains("below its clothes"));
         assert!(with(&|avatar| avatar.hanging.as_mut().unwrap().gaussian_nodes[3][1] = 7).contains("graph"));
         assert!(with(&|avatar| avatar.attachments[3].triangle = u32::MAX).contains("hang"));
         assert!(with(&|avatar| avatar.attachments[3].barycentric[1] = f32::NAN).contains("hang"));

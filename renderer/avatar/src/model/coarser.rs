@@ -43,6 +43,7 @@ impl Avatar {
         });
         Self {
             template: self.template.clone(),
+            undressed: self.undressed.clone(),
             places: heavier().map(|i| self.places[i]).collect(),
             attachments: heavier().map(|i| self.attachments[i]).collect(),
             skin: heavier().map(|i| self.skin[i]).collect(),

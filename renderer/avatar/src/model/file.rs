@@ -62,6 +62,24 @@ fn joint(row: JointRow, [x, y, z, qx, qy, qz, qw, matrix @ ..]: [f64; JOINT_NUMB
     }
 }
 
+/// Names of the arrays of a body: positions, normals, texture coordinates, triangles, joints and weights of the skin, parts.
+type BodyNames = [&'static str; 7];
+const BODY: BodyNames =
+    ["body.positions", "body.normals", "body.uvs", "body.triangles", "body.joints", "body.weights", "body.parts"];
+const UNDRESSED: BodyNames = [
+    "undressed.positions",
+    "undressed.normals",
+    "undressed.uvs",
+    "undressed.triangles",
+    "undressed.joints",
+    "undressed.weights",
+    "undressed.parts",
+];
+
+fn flat(list: &[Vec3]) -> Vec<[f32; 3]> {
+    list.iter().map(Vec3::to_array).collect()
+}
+
 /// Collection of arrays to write.
 #[derive(Default)]
 struct Arrays(Vec<(&'static str, Dtype, Vec<usize>, Vec<u8>)>);
@@ -78,6 +96,17 @@ impl Arrays {
         self.push(joints, Dtype::U16, 4, &numbers);
         let shares: Vec<[f32; 4]> = skin.iter().map(|skin| skin.weights).collect();
         self.push(weights, Dtype::F32, 4, &shares);
+    }
+
+    /// Adds the mesh of a body, without its skeleton.
+    fn body(&mut self, [positions, normals, uvs, triangles, joints, weights, parts]: BodyNames, body: &Template) {
+        self.push(positions, Dtype::F32, 3, &flat(&body.positions));
+        self.push(normals, Dtype::F32, 3, &flat(&body.normals));
+        self.push(uvs, Dtype::F32, 2, &body.uvs.iter().map(Vec2::to_array).collect::<Vec<_>>());
+        self.push(triangles, Dtype::U32, 3, &body.triangles);
+        self.skin([joints, weights], &body.skin);
+        let part = |part: &Part| Part::ALL.iter().position(|known| known == part).unwrap_or_default() as u8;
+        self.push(parts, Dtype::U8, 1, &body.parts.iter().map(part).collect::<Vec<_>>());
     }
 }
 
@@ -107,6 +136,27 @@ fn skin(file: &SafeTensors<'_>, [joints, weights]: [&str; 2]) -> Result<Vec<Skin
     Ok(joints.into_iter().zip(weights).map(|(joints, weights)| SkinWeights { joints, weights }).collect())
 }
 
+/// Reads the mesh of a body with this name and skeleton.
+fn body(
+    file: &SafeTensors<'_>,
+    [positions, normals, uvs, triangles, joints, weights, parts]: BodyNames,
+    (name, skeleton): (String, Skeleton),
+) -> Result<Template, String> {
+    let parts = rows::<u8, 1>(file, parts, Dtype::U8)?.into_iter().map(|[part]| {
+        Part::ALL.get(usize::from(part)).copied().ok_or_else(|| format!("body part {part} does not exist"))
+    });
+    Ok(Template {
+        name,
+        positions: vectors(file, positions)?,
+        normals: vectors(file, normals)?,
+        uvs: rows::<f32, 2>(file, uvs, Dtype::F32)?.into_iter().map(Vec2::from).collect(),
+        triangles: rows::<u32, 3>(file, triangles, Dtype::U32)?,
+        skin: skin(file, [joints, weights])?,
+        parts: parts.collect::<Result<_, _>>()?,
+        skeleton,
+    })
+}
+
 impl Avatar {
     /// Returns the bytes of the avatar's file. Equal avatars give equal bytes.
     ///
@@ -115,18 +165,14 @@ impl Avatar {
     pub fn to_bytes(&self) -> Result<Vec<u8>, AvatarError> {
         let fail = |problem: String| AvatarError::Format { path: "avatar".into(), problem };
         self.check().map_err(fail)?;
-        let Template { name, positions, normals, uvs, triangles, skin, parts, skeleton } = &self.template;
-        let flat = |list: &[Vec3]| -> Vec<[f32; 3]> { list.iter().map(Vec3::to_array).collect() };
+        let Template { name, skeleton, .. } = &self.template;
         let mut arrays = Arrays::default();
-        arrays.push("body.positions", Dtype::F32, 3, &flat(positions));
-        arrays.push("body.normals", Dtype::F32, 3, &flat(normals));
-        arrays.push("body.uvs", Dtype::F32, 2, &uvs.iter().map(Vec2::to_array).collect::<Vec<_>>());
-        arrays.push("body.triangles", Dtype::U32, 3, triangles);
-        arrays.skin(["body.joints", "body.weights"], skin);
+        arrays.body(BODY, &self.template);
+        if let Some(body) = &self.undressed {
+            arrays.body(UNDRESSED, body);
+        }
         let bones: Vec<_> = skeleton.joints().iter().map(numbers).collect();
         arrays.push("body.skeleton", Dtype::F64, JOINT_NUMBERS, &bones);
-        let part = |part: &Part| Part::ALL.iter().position(|known| known == part).unwrap_or_default() as u8;
-        arrays.push("body.parts", Dtype::U8, 1, &parts.iter().map(part).collect::<Vec<_>>());
         arrays.push("gaussians.places", Dtype::F32, 3, &flat(&self.places));
         let triangles: Vec<u32> = self.attachments.iter().map(|attachment| attachment.triangle).collect();
         arrays.push("gaussians.triangles", Dtype::U32, 1, &triangles);
@@ -212,18 +258,11 @@ impl Avatar {
             return Err(format!("numbers of {} joints for {}", numbers.len(), joints.len()));
         }
         let joints = joints.into_iter().zip(numbers).map(|(row, numbers)| joint(row, numbers));
-        let parts = rows::<u8, 1>(&file, "body.parts", Dtype::U8)?.into_iter().map(|[part]| {
-            Part::ALL.get(usize::from(part)).copied().ok_or_else(|| format!("body part {part} does not exist"))
-        });
-        let template = Template {
-            name: template,
-            positions: vectors(&file, "body.positions")?,
-            normals: vectors(&file, "body.normals")?,
-            uvs: rows::<f32, 2>(&file, "body.uvs", Dtype::F32)?.into_iter().map(Vec2::from).collect(),
-            triangles: rows::<u32, 3>(&file, "body.triangles", Dtype::U32)?,
-            skin: skin(&file, ["body.joints", "body.weights"])?,
-            parts: parts.collect::<Result<_, _>>()?,
-            skeleton: Skeleton::new(joints.collect()).map_err(|error| error.to_string())?,
+        let skeleton = Skeleton::new(joints.collect()).map_err(|error| error.to_string())?;
+        let template = body(&file, BODY, (template, skeleton))?;
+        let undressed = match file.tensor(UNDRESSED[0]) {
+            Err(_) => None,
+            Ok(_) => Some(body(&file, UNDRESSED, (template.name.clone(), template.skeleton.clone()))?),
         };
         let lists = LISTS.map(|name| rows::<f32, 4>(&file, name, Dtype::F32));
         let [offset, shape, rotation, harmonics] = lists;
@@ -264,6 +303,7 @@ impl Avatar {
         };
         let avatar = Self {
             template,
+            undressed,
             places: vectors(&file, "gaussians.places")?,
             attachments: attachments.collect(),
             skin: skin(&file, ["gaussians.joints", "gaussians.weights"])?,
@@ -293,6 +333,9 @@ mod tests {
         let mut avatar = small(200, 9);
         avatar.known_poses = KnownPoses::new(&[1, 2, 3].map(|seed| random_pose(&avatar, seed).0));
         avatar.light.terms[3] = [0.1, 0.2, 0.3];
+        let mut body = avatar.template.clone();
+        body.triangles.truncate(20);
+        avatar.undressed = Some(body);
         avatar.card = Card { name: "A".to_owned(), cameras: vec!["00".to_owned()], steps: 3, ..Card::default() };
         let bytes = avatar.to_bytes().unwrap();
         // Printed in full they would fill screens.

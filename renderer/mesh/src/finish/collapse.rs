@@ -6,7 +6,7 @@ use std::collections::BinaryHeap;
 use glam::{DVec3, Vec3};
 
 use crate::connectivity::Connectivity;
-use crate::finish::quadric::Quadric;
+use crate::finish::{around::triangles_around, quadric::Quadric};
 
 /// Weight of the squared way of a vertex against that of the squared distance from its planes: even triangles where the surface is flat.
 const EVENNESS: f64 = 1e-3;
@@ -88,10 +88,6 @@ pub fn collapse(positions: &[Vec3], triangles: &[[u32; 3]], target: usize) -> Ve
 impl<'a> Collapsing<'a> {
     fn new(positions: &'a [Vec3], triangles: &[[u32; 3]]) -> Self {
         let count = positions.len();
-        let mut around = vec![Vec::new(); count];
-        for (t, triangle) in (0u32..).zip(triangles) {
-            triangle.iter().for_each(|i| around[*i as usize].push(t));
-        }
         let mut is_locked = vec![false; count];
         Connectivity::with_faults(triangles).1.iter().for_each(|i| is_locked[*i as usize] = true);
         let mut surface = Self {
@@ -99,7 +95,7 @@ impl<'a> Collapsing<'a> {
             triangles: triangles.to_vec(),
             is_alive: vec![true; triangles.len()],
             alive: triangles.len(),
-            around,
+            around: triangles_around(count, triangles),
             quadrics: vec![Quadric::ZERO; count],
             is_border: vec![false; count],
             is_locked,

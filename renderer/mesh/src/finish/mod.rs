@@ -1,5 +1,6 @@
 //! From a fused surface to an even, smooth mesh of a number of triangles.
 
+mod around;
 mod collapse;
 pub(crate) mod decimate;
 mod quadric;

@@ -3,6 +3,7 @@
 use glam::Vec3;
 use rayon::prelude::*;
 
+use super::around::triangles_around;
 use crate::TriMesh;
 use crate::nearest::Surface;
 
@@ -21,7 +22,7 @@ pub(crate) fn relax(mesh: &mut TriMesh, original: &TriMesh) {
     }
     let surface = Surface::new(original);
     let neighbors = neighbors(mesh);
-    let around = triangles_around(mesh);
+    let around = triangles_around(mesh.positions.len(), &mesh.triangles);
     for _ in 0..ROUNDS {
         let normals = mesh.normals();
         let moved: Vec<Vec3> = (0..mesh.positions.len())
@@ -74,14 +75,6 @@ fn neighbors(mesh: &TriMesh) -> Vec<Vec<u32>> {
         row.dedup();
     }
     neighbors
-}
-
-fn triangles_around(mesh: &TriMesh) -> Vec<Vec<u32>> {
-    let mut around = vec![Vec::new(); mesh.positions.len()];
-    for (t, triangle) in (0u32..).zip(&mesh.triangles) {
-        triangle.iter().for_each(|i| around[*i as usize].push(t));
-    }
-    around
 }
 
 #[cfg(test)]

@@ -3,6 +3,7 @@
 use glam::{DVec3, Vec3};
 use rayon::prelude::*;
 
+use super::around::triangles_around;
 use crate::TriMesh;
 use crate::density::median;
 use crate::mesh::area_vector;
@@ -56,10 +57,7 @@ pub(crate) fn smooth(mesh: &mut TriMesh, spacing_m: f32) {
 
 impl Neighbors {
     fn new(mesh: &TriMesh) -> Self {
-        let mut around = vec![Vec::new(); mesh.positions.len()];
-        for (t, triangle) in (0u32..).zip(&mesh.triangles) {
-            triangle.iter().for_each(|i| around[*i as usize].push(t));
-        }
+        let around = triangles_around(mesh.positions.len(), &mesh.triangles);
         let beside = |triangle: &[u32; 3]| {
             let mut beside: Vec<u32> = triangle.iter().flat_map(|i| &around[*i as usize]).copied().collect();
             beside.sort_unstable();

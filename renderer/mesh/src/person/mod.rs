@@ -64,14 +64,11 @@ pub struct PersonOptions<'a> {
     pub triangles: usize,
     /// Texels along a side of the texture.
     pub texture_side: u32,
-    /// Body of the avatar without its clothes, in the same canonical space: a skirt becomes a shell around its legs. Without it the mesh
-    /// closes a skirt at the hem.
-    pub undressed: Option<&'a Template>,
 }
 
 impl Default for PersonOptions<'_> {
     fn default() -> Self {
-        Self { mesh: MeshOptions::default(), triangles: 60_000, texture_side: 2048, undressed: None }
+        Self { mesh: MeshOptions::default(), triangles: 60_000, texture_side: 2048 }
     }
 }
 
@@ -111,7 +108,8 @@ pub struct ShellReport {
 
 impl MeshedPerson {
     /// Meshes the surface that an avatar's Gaussians draw in the rest pose, where a hand cannot grow onto a hip, simplifies and
-    /// smooths it, and gives it skin, nodes and a texture.
+    /// smooths it, and gives it skin, nodes and a texture. A skirt becomes a shell around the legs of [`Avatar::undressed`]; without
+    /// that body it is closed at the hem.
     ///
     /// # Errors
     /// As [`mesh_from_points`], and [`PersonError`] where the mesh cannot be simplified or textured.
@@ -120,7 +118,8 @@ impl MeshedPerson {
         avatar.pose(&Bones::at_rest(&avatar.template.skeleton), None, &mut posed);
         let points = drawn_points(&posed);
         let started = Instant::now();
-        let hollow = match options.undressed {
+        let undressed = avatar.undressed.as_ref();
+        let hollow = match undressed {
             Some(body) => hollow_of(avatar, body, &points, &options.mesh)?,
             None => None,
         };
@@ -137,7 +136,7 @@ impl MeshedPerson {
         let simplified_s = started.elapsed().as_secs_f64();
         let (sides, shell) = hollow.as_ref().map(|hollow| hollow.shell(&mut simple.mesh, hollow_s)).unzip();
         let started = Instant::now();
-        let inner = hollow.as_ref().zip(options.undressed).zip(sides.as_deref());
+        let inner = hollow.as_ref().zip(undressed).zip(sides.as_deref());
         let (tied, skin, stand_ins) = Self::tie(&simple.mesh, avatar, &posed, inner);
         let tied_s = started.elapsed().as_secs_f64();
         let started = Instant::now();

@@ -98,19 +98,21 @@ impl Deformation {
         let count = coarse.gaussians.len();
         let landmarks = Landmarks::new(surface, graph);
         let mut tracker = DeformTracker::new(&coarse.graph, &coarse.gaussians.skin, options.solver)?;
+        let hangs = hangs_from_hips(&template.skeleton);
         let of_node = |&g: &u32| {
-            let normal = surface.normals.get(g as usize)?.as_dvec3();
-            Some((normal, *surface.parts.get(g as usize)?))
+            let g = g as usize;
+            let is_loose = hangs(*surface.positions.get(g)?, surface.skin.get(g)?);
+            Some((surface.normals.get(g)?.as_dvec3(), (*surface.parts.get(g)?, is_loose)))
         };
-        let (normals, parts): (Vec<DVec3>, Vec<Part>) = graph.node_gaussian.iter().filter_map(of_node).unzip();
-        let stiffness: Vec<f64> = parts.iter().map(|&part| options.stiffness(part)).collect();
+        let (normals, parts): (Vec<DVec3>, Vec<(Part, bool)>) = graph.node_gaussian.iter().filter_map(of_node).unzip();
+        let stiffness: Vec<f64> = parts.iter().map(|&(part, _)| options.stiffness(part)).collect();
         tracker = tracker.with_stiffness(&stiffness)?;
-        tracker = tracker.with_thickness(normals, parts.iter().map(|&part| part as usize).collect())?;
+        let clothes: Vec<(usize, bool)> = parts.iter().map(|&(part, is_loose)| (part as usize, is_loose)).collect();
+        tracker = tracker.with_thickness(normals, &clothes)?;
         if let Some(mean) = mean {
             tracker = tracker.with_mean(mean)?;
         }
         // Elsewhere images are finer than outlines, and hats and ponytails, which the body lacks, pull head and shoulders outwards.
-        let hangs = hangs_from_hips(&template.skeleton);
         let hung = coarse.gaussians.positions.iter().zip(&coarse.gaussians.skin);
         let is_loose: Vec<bool> = hung.map(|(point, skin)| hangs(*point, skin)).collect();
         let outline_steps = if is_loose.contains(&true) { options.outline_steps } else { 0 };

@@ -139,6 +139,7 @@ impl PersonLearner {
                 rig: rig.clone(),
                 settings: settings.clone(),
                 template: subject.template().clone(),
+                undressed: subject.undressed().cloned(),
                 base,
                 in_use: subject.avatar().cloned(),
                 stopped: Arc::default(),

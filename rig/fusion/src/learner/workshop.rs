@@ -49,6 +49,8 @@ pub(crate) struct Beginning {
     pub rig: Rig,
     pub settings: SessionSettings,
     pub template: Template,
+    /// Body of a person in a skirt or coat.
+    pub undressed: Option<Template>,
     pub base: Arc<GraphedSurface>,
     /// Avatar that the person is made of already.
     pub in_use: Option<Arc<Avatar>>,
@@ -111,6 +113,8 @@ pub(crate) struct Workshop {
     /// Skeleton of the tracked person, and whether a graph deforms it.
     skeleton: Skeleton,
     is_deformed: bool,
+    /// Body of a person in a skirt or coat.
+    undressed: Option<Template>,
     /// Time of the work since the last result.
     took: Duration,
     /// Cameras of the rig.
@@ -123,7 +127,7 @@ pub(crate) struct Workshop {
 impl Workshop {
     /// Starts from the person as it is.
     pub fn new(beginning: Beginning) -> Result<Self, FusionError> {
-        let Beginning { gpu, rig, settings, template, base, in_use, stopped } = beginning;
+        let Beginning { gpu, rig, settings, template, undressed, base, in_use, stopped } = beginning;
         let in_use_is_known = in_use.is_some();
         let avatar = in_use.as_ref().map(|avatar| avatar.shared_on(&base.graph));
         let cameras = rig.cameras.iter().map(|camera| camera.id.clone()).collect();
@@ -145,6 +149,7 @@ impl Workshop {
             succeeded: true,
             proven: in_use_is_known,
             skeleton,
+            undressed,
             is_deformed: settings.tracking.options().is_some(),
             took: Duration::ZERO,
             cameras,
@@ -236,7 +241,10 @@ impl Workshop {
         let left_out = Some(camera).filter(|_| self.is_trial);
         let avatar = match self.avatar.take() {
             Some(avatar) => avatar,
-            None => Arc::new(self.judge.surface(&sets, left_out.as_ref())?),
+            None => {
+                let surface = self.judge.surface(&sets, left_out.as_ref())?;
+                Arc::new(Avatar { undressed: self.undressed.clone(), ..surface })
+            }
         };
         let (mut frames, mut views) = (Vec::new(), Vec::<TrainingView>::new());
         for (_, set) in self.sets.values().filter(|(_, set)| !is_held_back(set.choice.slot)) {

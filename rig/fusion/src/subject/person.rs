@@ -262,6 +262,13 @@ impl Subject {
         self.shape.undressed.as_ref().map_or(&self.shape.template, |(body, _)| body)
     }
 
+    /// Returns the body of a person in a skirt or coat; `None` without one.
+    #[must_use]
+    pub fn undressed(&self) -> Option<&Template> {
+        let (body, _) = self.shape.undressed.as_ref().filter(|(_, outfit)| outfit.skirt.is_some())?;
+        Some(body)
+    }
+
     /// Returns the person's clothes.
     pub(crate) fn outfit(&self) -> Outfit {
         self.shape.undressed.as_ref().map_or_else(Outfit::default, |(_, outfit)| *outfit)

@@ -18,8 +18,8 @@ fn avatar_of(dressed: &Template) -> Avatar {
 }
 
 fn meshed(avatar: &Avatar, undressed: Option<&Template>) -> (MeshedPerson, PersonReport) {
-    let options = PersonOptions { triangles: 40_000, texture_side: 256, undressed, ..PersonOptions::default() };
-    MeshedPerson::of_avatar(avatar, &options).unwrap()
+    let options = PersonOptions { triangles: 40_000, texture_side: 256, ..PersonOptions::default() };
+    MeshedPerson::of_avatar(&Avatar { undressed: undressed.cloned(), ..avatar.clone() }, &options).unwrap()
 }
 
 /// Returns the winding number of closed triangles, by the sum over all solid angles.
@@ -122,12 +122,12 @@ fn bodies_without_a_skirt_keep_their_mesh_and_short_ones_stay_solid() {
 #[test]
 fn the_same_bytes_come_out_of_one_thread_and_of_several() {
     let body = body();
-    let avatar = avatar_of(&WORN.on(&body).unwrap());
+    let dressed = avatar_of(&WORN.on(&body).unwrap());
+    let avatar = Avatar { undressed: Some(body), ..dressed };
     let run = |threads: usize| {
         let pool = rayon::ThreadPoolBuilder::new().num_threads(threads).build().unwrap();
         let mesh = crate::MeshOptions { voxel_m: Some(0.016), ..crate::MeshOptions::default() };
-        let undressed = Some(&body);
-        let options = PersonOptions { mesh, triangles: 10_000, texture_side: 512, undressed };
+        let options = PersonOptions { mesh, triangles: 10_000, texture_side: 512 };
         pool.install(|| MeshedPerson::of_avatar(&avatar, &options).unwrap())
     };
     let ((one, first), (other, second)) = (run(1), run(3));
@@ -140,14 +140,18 @@ fn the_same_bytes_come_out_of_one_thread_and_of_several() {
 fn poisoned_inputs_are_refused_or_left_out() {
     let body = body();
     let mut avatar = avatar_of(&WORN.on(&body).unwrap());
-    let options = |undressed| PersonOptions { texture_side: 256, undressed, ..PersonOptions::default() };
+    let fails = |avatar: &Avatar, body: &Template| {
+        let avatar = Avatar { undressed: Some(body.clone()), ..avatar.clone() };
+        let options = PersonOptions { texture_side: 256, ..PersonOptions::default() };
+        MeshedPerson::of_avatar(&avatar, &options).unwrap_err().to_string()
+    };
     let mut damaged = body.clone();
     damaged.positions[7].x = f32::NAN;
-    let error = MeshedPerson::of_avatar(&avatar, &options(Some(&damaged))).unwrap_err().to_string();
+    let error = fails(&avatar, &damaged);
     assert!(error.contains("body below the clothes") && error.contains("not a finite number"), "{error}");
     let mut empty = body.clone();
     empty.triangles.clear();
-    assert!(MeshedPerson::of_avatar(&avatar, &options(Some(&empty))).is_err());
+    fails(&avatar, &empty);
 
     let points = |avatar: &Avatar| -> Vec<OrientedPoint> {
         let row = |place: &Vec3| OrientedPoint { position: *place, normal: *place, weight: 1.0, uncertainty_m: 0.0 };
