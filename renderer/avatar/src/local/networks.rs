@@ -6,8 +6,8 @@
 //! convolutional encoder, and an atlas of spherical harmonics that is sampled for each Gaussian (Eq. 14).
 //!
 //! Networks predict residuals that start at zero, so that the first image is that of the initial avatar. Every step
-//! writes their outputs to the avatar's lists, so that the result needs no network. Encoding, groups and sampling are
-//! linear: their derivatives are computed by hand, those of the layers by burn.
+//! writes their outputs to the avatar's lists, so that the result needs no network. Derivatives of encoding, groups, sampling
+//! and convolutions are computed by hand, those of the decoders by burn.
 
 use std::collections::BTreeMap;
 
@@ -22,7 +22,7 @@ use crate::local::atlas_map::{AtlasLayout, AtlasMap};
 use crate::local::decoders::{self, OFFSET_M, branches, decode};
 use crate::local::groups::{Groups, farthest};
 use crate::local::hash::{Box3, FEATURES, HashEncoding, LEVELS, ROWS, WIDTH};
-use crate::local::texture;
+use crate::local::texture::{self, Encoded};
 
 use crate::error::AvatarError;
 use crate::model::avatar::Avatar;
@@ -102,7 +102,7 @@ struct Tape {
     tensors: Tensors,
     /// Features and outputs of all branches, per stage.
     stages: Vec<(Tensor<2>, Vec<Tensor<2>>)>,
-    atlas: Option<Tensor<4>>,
+    atlas: Option<Encoded>,
 }
 
 /// Local networks of one avatar.
@@ -119,7 +119,7 @@ pub(crate) struct Local {
     atlas: Option<(AtlasMap, Vec<f32>)>,
     /// Parameters that burn differentiates.
     networks: BTreeMap<String, Parameter>,
-    /// Parameters that are differentiated by hand: displacements and hash tables.
+    /// Parameters that are differentiated by hand: displacements, hash tables, texture and its encoder.
     tables: BTreeMap<String, Parameter>,
     moments: BTreeMap<String, Moments>,
     tape: Option<Tape>,
@@ -167,7 +167,10 @@ impl Local {
             start.harmonics.fill([0.0; 4]);
             atlas = Some((map, first));
         }
-        let (networks, tables) = (drawn(networks, seed), drawn(tables, seed.wrapping_add(1)));
+        let (networks, by_hand): (BTreeMap<_, _>, BTreeMap<_, _>) =
+            drawn(networks, seed).into_iter().partition(|(name, _)| name.starts_with("stage"));
+        let mut tables = drawn(tables, seed.wrapping_add(1));
+        tables.extend(by_hand);
         let zeros =
             |(name, p): (&String, &Parameter)| (name.clone(), [vec![0.0; p.values.len()], vec![0.0; p.values.len()]]);
         let moments = networks.iter().chain(&tables).map(zeros).collect();
@@ -231,10 +234,10 @@ impl Local {
         }
         let coefficients = lists.order().coefficients();
         let atlas = self.atlas.as_ref().map(|(map, first)| {
-            let atlas = texture::encode(&tensors, &self.device);
+            let encoded = Encoded::new(&self.tables, map);
             map.query(first, 3, &mut lists.harmonics, coefficients);
-            map.query(&to_vec(atlas.clone()), 3 * coefficients, &mut lists.harmonics, coefficients);
-            atlas
+            map.query(&encoded.atlas, 3 * coefficients, &mut lists.harmonics, coefficients);
+            encoded
         });
         *into = lists;
         self.tape = Some(Tape { tensors, stages, atlas });
@@ -316,8 +319,7 @@ impl Local {
         let coefficients = self.start.order().coefficients();
         let mut totals: Vec<Tensor<1>> = Vec::new();
         if let (Some(atlas), Some((map, _))) = (atlas, &self.atlas) {
-            let wanted = TensorData::new(map.backward(&slopes[3], coefficients), atlas.dims());
-            totals.push((atlas * Tensor::<4>::from_data(wanted, &self.device)).sum());
+            gradients = atlas.backward(&map.backward(&slopes[3], coefficients));
         }
         let mut displacement = vec![0.0; 4 * self.places.len()];
         for (stage, (Stage { groups, inputs, .. }, (_, outputs))) in self.stages.iter().zip(&stages).enumerate() {
@@ -337,6 +339,7 @@ impl Local {
                 }
             }
         }
+        // Colours alone move no Gaussian.
         let Some(total) = totals.into_iter().reduce(|a, b| a + b) else { return gradients };
         let found = total.backward();
         tensors.add_gradients(&found, &mut gradients);

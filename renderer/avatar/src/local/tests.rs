@@ -19,7 +19,9 @@ fn settings(stages: usize) -> LocalSettings {
 /// Numbers at random in place of zeros, so that every layer counts.
 fn shake(local: &mut Local) {
     let mut random = StdRng::seed_from_u64(3);
-    for parameter in local.networks.values_mut() {
+    let of_texture =
+        local.tables.iter_mut().filter(|(name, _)| name.starts_with("texture") || name.starts_with("encoder"));
+    for parameter in local.networks.values_mut().chain(of_texture.map(|(_, parameter)| parameter)) {
         parameter.values.iter_mut().for_each(|value| *value += random.random_range(-0.1f32..0.1));
     }
     let displacement = local.tables.get_mut("displacement").unwrap();
