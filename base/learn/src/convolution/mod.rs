@@ -1,8 +1,8 @@
 //! Convolutions of 3x3 taps with their derivatives, on the processor.
 //!
 //! Sums stay in vector registers while all taps of all channels are added; a strip of rows is one task. The order of
-//! additions depends on the sizes alone, so that results are equal for any number of threads. `burn` computes the
-//! derivative of the weights as a convolution with kernels as large as the image, which takes several times as long (`cargo bench -p
+//! additions depends on the sizes and the vector instructions alone, so that results are equal for any number of threads. `burn` computes the
+//! derivative of the weights as a convolution with kernels as large as the image, which takes longer (`cargo bench -p
 //! flyrig-learn`).
 
 mod planes;
@@ -85,6 +85,7 @@ impl Convolution {
     #[must_use]
     pub fn backward(&self, input: &Planes, slopes: &Planes, rectified: bool) -> ConvolutionSlopes {
         debug_assert!(input.channels() == self.inputs && slopes.channels() == self.outputs);
+        debug_assert_eq!(input.size(), slopes.size());
         let after = if rectified { After::Gate(input) } else { After::Nothing };
         let none = vec![0.0; self.inputs.next_multiple_of(BLOCK)];
         let starts: Vec<usize> = (0..input.size()[0]).step_by(ROWS).collect();

@@ -27,7 +27,10 @@ impl Planes {
     #[must_use]
     pub fn new(channels: usize, height: usize, width: usize, values: &[f32]) -> Self {
         let mut planes = Self::zeros(channels, height, width);
-        let mut rows = values.chunks(width.max(1));
+        if width == 0 {
+            return planes;
+        }
+        let mut rows = values.chunks(width);
         for channel in 0..channels {
             for y in 0..height {
                 let Some(row) = rows.next() else { return planes };

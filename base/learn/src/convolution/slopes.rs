@@ -8,7 +8,7 @@ use super::TAPS;
 use super::planes::Planes;
 use super::sums::BLOCK;
 
-/// What some rows add to the derivatives.
+/// Derivatives that some rows add.
 #[derive(Debug)]
 pub(super) struct WeightSlopes<'a> {
     input: &'a Planes,

@@ -90,6 +90,17 @@ fn outputs_and_derivatives_are_those_of_the_definition() {
 }
 
 #[test]
+fn other_vector_instructions_give_the_same_results() {
+    for limit in ["avx2", "none"] {
+        let mut program = std::process::Command::new(std::env::current_exe().unwrap());
+        let test = "convolution::tests::outputs_and_derivatives_are_those_of_the_definition";
+        let run = program.args([test, "--exact"]).env("FLYRIG_VECTORS", limit).output().unwrap();
+        let printed = String::from_utf8_lossy(&run.stdout);
+        assert!(run.status.success() && printed.contains("1 passed"), "{limit}: {printed}");
+    }
+}
+
+#[test]
 fn derivatives_of_two_layers_are_finite_differences() {
     let mut random = SmallRng::seed_from_u64(2);
     let [inner, outer] = [[2, 6, 6, 19], [6, 3, 6, 19]];
@@ -171,4 +182,5 @@ fn nothing_gives_nothing() {
     assert!(Convolution::new(0, &[], &[]).forward(&Planes::zeros(0, 4, 4), true).to_vec().is_empty());
     assert_eq!(Convolution::new(0, &[], &[2.0]).forward(&Planes::zeros(0, 1, 2), true).to_vec(), [2.0, 2.0]);
     assert_eq!(Planes::new(1, 2, 2, &[1.0, 2.0, 3.0]).to_vec(), [1.0, 2.0, 3.0, 0.0]);
+    assert!(Planes::new(1, 2, 0, &[1.0, 2.0]) == Planes::zeros(1, 2, 0));
 }

@@ -17,7 +17,10 @@ impl Avatar {
     /// [`AvatarError::Body`] for unknown targets, weights out of range, and bodies whose shape cannot be edited.
     pub fn reshape(&mut self, change: &ShapeParams) -> Result<(), AvatarError> {
         let new = self.template.reshape(change)?;
-        let reshape = |body: &Template| body.reshape(change).map(|new| new.template);
+        // Joints that are placed by the mesh have one place for both.
+        let reshape = |body: &Template| {
+            body.reshape(change).map(|under| Template { skeleton: new.template.skeleton.clone(), ..under.template })
+        };
         let undressed = self.undressed.as_ref().map(reshape).transpose()?;
         for i in 0..self.places.len() {
             let attachment = self.attachments[i];

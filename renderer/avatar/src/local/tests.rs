@@ -240,7 +240,7 @@ fn lists_without_networks_stay_as_they_are() {
             let slopes = now.lists().map(|list| vec![[0.1 * step as f32; 4]; list.len()]);
             local.descend(&slopes, 0.5);
         }
-        assert!(now.is_finite() && flyrig_learn::is_finite(&local.networks));
+        assert!(now.is_finite() && flyrig_learn::is_finite(&local.networks) && flyrig_learn::is_finite(&local.tables));
     }
 }
 
@@ -277,11 +277,11 @@ fn poison_spoils_no_network_and_few_gaussians_are_enough() {
     local.evaluate(&mut now);
     assert!(now.is_finite());
     // Without an evaluation before it, and with lists of another avatar, nothing happens.
-    let before = local.networks.clone();
+    let before = (local.networks.clone(), local.tables.clone());
     local.tape = None;
     local.descend(&now.lists().map(<[Element]>::to_vec), 0.5);
     local.descend(&[], 0.5);
-    assert!(local.networks == before);
+    assert!((local.networks, local.tables) == before);
     for count in [1, 2, 3] {
         let mut few = avatar.clone();
         few.places.truncate(count);

@@ -38,7 +38,7 @@ pub(super) struct Encoded {
     /// Atlas: chart, channel, row, column.
     pub atlas: Vec<f32>,
     layers: [Convolution; 3],
-    /// What each layer takes, for every chart.
+    /// Inputs of each layer, for every chart.
     inputs: Vec<[Planes; 3]>,
 }
 

@@ -103,7 +103,7 @@ impl Attachment {
 pub struct Avatar {
     /// Body, clothes included.
     pub template: Template,
-    /// Body without the skirt or coat that has a surface of its own, in the same canonical space; `None` without one, and in files of before.
+    /// Body without the skirt or coat that has a surface of its own, nor shoes, in the same canonical space; `None` without one, and in files of earlier versions.
     pub undressed: Option<Template>,
     /// Canonical positions of the Gaussians on the body, metres.
     pub places: Vec<Vec3>,
