@@ -1,4 +1,5 @@
 //! Derivatives of a loss with respect to the weights of a convolution.
+#![allow(clippy::needless_range_loop)] // adapters of iterators are not inlined into code for vector instructions
 
 use std::ops::Range;
 
@@ -44,7 +45,7 @@ impl<'a> WeightSlopes<'a> {
         for channel in first..first + CHANNELS {
             let mut sum = simd.splat_f32s(0.0);
             for y in self.rows.clone() {
-                let pixels = self.pixels::<S>(self.slopes, self.slopes.start(y + 1, channel));
+                let pixels = vectors::<S>(self.slopes, self.slopes.start(y + 1, channel));
                 for at in 0..pixels.len() {
                     sum = simd.add_f32s(sum, pixels[at]);
                 }
@@ -53,14 +54,7 @@ impl<'a> WeightSlopes<'a> {
         }
     }
 
-    /// Returns the vectors of a row. Beyond the last pixel they are zero.
-    #[inline(always)]
-    fn pixels<'b, S: Simd>(&self, planes: &'b Planes, start: usize) -> &'b [S::f32s] {
-        S::as_simd_f32s(&planes.values()[start..start + planes.padded_width()]).0
-    }
-
-    /// Returns sums of products for the three taps of a row, lane by lane. Loops count, since adapters of iterators are not inlined
-    /// into code for vector instructions.
+    /// Returns sums of products for the three taps of a row, lane by lane.
     #[inline(always)]
     fn products<S: Simd, const CHANNELS: usize>(
         &self,
@@ -76,11 +70,11 @@ impl<'a> WeightSlopes<'a> {
             let from = self.input.start(y + row, input) - 1;
             let mut pixels: [&[S::f32s]; 3] = [&[]; 3];
             for column in 0..3 {
-                pixels[column] = &self.pixels::<S>(self.input, from + column)[..count];
+                pixels[column] = &vectors::<S>(self.input, from + column)[..count];
             }
             let mut slopes: [&[S::f32s]; CHANNELS] = [&[]; CHANNELS];
             for channel in 0..CHANNELS {
-                slopes[channel] = &self.pixels::<S>(self.slopes, self.slopes.start(y + 1, first + channel))[..count];
+                slopes[channel] = &vectors::<S>(self.slopes, self.slopes.start(y + 1, first + channel))[..count];
             }
             for at in 0..count {
                 for channel in 0..CHANNELS {
@@ -93,6 +87,12 @@ impl<'a> WeightSlopes<'a> {
         }
         sums
     }
+}
+
+/// Returns the vectors of a row. Beyond the last pixel they are zero.
+#[inline(always)]
+fn vectors<S: Simd>(planes: &Planes, start: usize) -> &[S::f32s] {
+    S::as_simd_f32s(&planes.values()[start..start + planes.padded_width()]).0
 }
 
 impl WithSimd for &mut WeightSlopes<'_> {

@@ -1,4 +1,5 @@
 //! Sums over the taps and channels of a convolution.
+#![allow(clippy::needless_range_loop)] // adapters of iterators are not inlined into code for vector instructions
 
 use pulp::{Simd, WithSimd};
 
