@@ -66,7 +66,7 @@ fn own(layer: &Layer, [inputs, outputs, side]: [usize; 3], runs: usize) -> ([f64
     ([forward, backward], [output.to_vec(), found.weights, found.biases, found.input.to_vec()])
 }
 
-/// The same by burn. Its derivatives are timed with the sum of products whose derivative is `slopes`.
+/// Returns what [`own`] does, by burn. Its derivatives are timed with the sum of products whose derivative is `slopes`.
 fn burn(layer: &Layer, [inputs, outputs, side]: [usize; 3], runs: usize) -> ([f64; 2], [Vec<f32>; 4]) {
     let device = Device::flex().autodiff();
     let tensor = |values: &[f32], shape: [usize; 4]| {

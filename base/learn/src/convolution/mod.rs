@@ -27,7 +27,7 @@ pub struct Convolution {
     outputs: usize,
     /// For each [`BLOCK`] of outputs, and for each input: taps of these outputs side by side. Zero beyond the last output.
     weights: Vec<f32>,
-    /// The same from outputs to inputs, turned by half a turn, for the derivative of the input.
+    /// Weights from outputs to inputs in the same order, turned by half a turn, for the derivative of the input.
     turned: Vec<f32>,
     /// One for each output, zero beyond the last.
     biases: Vec<f32>,
