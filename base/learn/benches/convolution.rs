@@ -78,7 +78,7 @@ fn burn(layer: &Layer, [inputs, outputs, side]: [usize; 3], runs: usize) -> ([f6
     let slopes = tensor(&layer.slopes, [1, outputs, side, side]);
     let options = || ConvOptions::new([1; 2], [1; 2], [1; 2], 1);
     let apply = || module::conv2d(input.clone(), weights.clone(), Some(biases.clone()), options());
-    let (forward, output) = median(runs, || apply());
+    let (forward, output) = median(runs, &apply);
     let (both, found) = median(runs, || (apply() * slopes.clone()).sum().backward());
     let gradient = |of: Option<Vec<f32>>| of.unwrap_or_default();
     (
