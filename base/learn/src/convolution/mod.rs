@@ -13,10 +13,8 @@ use rayon::prelude::*;
 
 pub use planes::Planes;
 use slopes::WeightSlopes;
-use sums::{After, BLOCK, Strip};
+use sums::{After, BLOCK, Strip, TAPS};
 
-/// Taps of one pair of channels.
-const TAPS: usize = 9;
 /// Rows of a task. More would leave the first-level cache, fewer would sum up more often.
 const ROWS: usize = 8;
 

@@ -5,9 +5,8 @@ use std::ops::Range;
 
 use pulp::{Simd, WithSimd};
 
-use super::TAPS;
 use super::planes::Planes;
-use super::sums::BLOCK;
+use super::sums::{BLOCK, TAPS};
 
 /// Derivatives that some rows add.
 #[derive(Debug)]

@@ -3,9 +3,10 @@
 
 use pulp::{Simd, WithSimd};
 
-use super::TAPS;
 use super::planes::Planes;
 
+/// Taps of one pair of channels.
+pub(super) const TAPS: usize = 9;
 /// Channels whose weights lie side by side.
 pub(super) const BLOCK: usize = 4;
 
