@@ -56,6 +56,18 @@ pub fn write_dataset() -> Result<Dataset> {
 /// # Errors
 /// Fails when there is no graphics adapter or the folder cannot be written.
 pub fn write_dataset_of(seed: u64) -> Result<Dataset> {
+    write(seed, ExportOptions { frames: FRAMES, truth: false })
+}
+
+/// Exports the first frames of the same capture with its ground truth.
+///
+/// # Errors
+/// Fails as [`write_dataset_of`] does.
+pub fn write_dataset_with_truth(seed: u64, frames: u64) -> Result<Dataset> {
+    write(seed, ExportOptions { frames, truth: true })
+}
+
+fn write(seed: u64, options: ExportOptions) -> Result<Dataset> {
     let gpu = GpuContext::new(&AdapterChoice::Best)?;
     let mut config = SimConfig { seed, width: SIDE, height: SIDE, texture_px: 256, ..SimConfig::default() };
     // Turn fast, so that few frames show every side.
@@ -63,7 +75,7 @@ pub fn write_dataset_of(seed: u64) -> Result<Dataset> {
     let mut simulator = Simulator::new(&gpu, &config)?;
     let folder = tempfile::tempdir()?;
     let root = folder.path().join("data");
-    export(&mut simulator, &root, ExportOptions { frames: FRAMES, truth: false }, &mut |_| true)?;
+    export(&mut simulator, &root, options, &mut |_| true)?;
     // The simulator's calibration is right.
     flyrig_takes::mark_checked(&root)?;
     Ok(Dataset { root, folder })

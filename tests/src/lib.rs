@@ -7,6 +7,6 @@ mod ports;
 mod running;
 
 pub use command::{Finished, run};
-pub use dataset::{Dataset, FRAMES, SIDE, copy_folder, write_dataset, write_dataset_of};
+pub use dataset::{Dataset, FRAMES, SIDE, copy_folder, write_dataset, write_dataset_of, write_dataset_with_truth};
 pub use ports::free_port;
 pub use running::Running;

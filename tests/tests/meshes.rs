@@ -5,7 +5,7 @@
 use std::{fs, path::Path};
 
 use flyrig_body::{load_gltf, skin_mesh};
-use flyrig_tests::{run, write_dataset};
+use flyrig_tests::{run, write_dataset, write_dataset_with_truth};
 
 const PROGRAM: &str = env!("CARGO_BIN_EXE_flyrig-under-test");
 const GIVEN: [&str; 4] = ["--pose", "given", "--masks", "given"];
@@ -95,6 +95,40 @@ fn a_take_becomes_a_closed_mesh_that_moves_as_the_person_does() {
     refused(&["missing.flyavatar", "--out", "x"], "missing.flyavatar does not exist");
     fs::write(folder.path().join("broken.flyavatar"), b"nothing").unwrap();
     refused(&["broken.flyavatar", "--out", "x"], "broken.flyavatar");
+}
+
+#[test]
+fn depth_images_pull_the_surface_and_wrong_ones_are_named() {
+    let data = write_dataset_with_truth(1, 4).unwrap();
+    let folder = tempfile::tempdir().unwrap();
+    let take = data.root.to_string_lossy().into_owned();
+    let with = |depth: &Path, more: &[&str]| {
+        let depth = depth.to_string_lossy().into_owned();
+        let inputs = ["mesh", &take, "--inputs", "00,02,04", "--gaussians", "4000", "--out", "m", "--depth", &depth];
+        run(PROGRAM, &[&inputs[..], &GIVEN, &SMALL, more].concat(), folder.path()).unwrap()
+    };
+    let refused = |depth: &Path, more: &[&str], text: &str| {
+        let failed = with(depth, more);
+        assert_eq!(failed.code, Some(1), "{failed:?}");
+        assert!(failed.stderr.contains(text), "{}", failed.stderr);
+        assert_eq!(fs::read_dir(folder.path()).unwrap().count(), 0, "a file is left");
+    };
+    let truth = data.root.join("truth");
+    refused(&truth, &["--steps", "0"], "--steps 0 fits nothing, and --depth is for the fit");
+    refused(&data.root.join("truth/surface"), &[], "has no folder of an input camera (00, 02, 04)");
+    let short = data.root.join("short");
+    fs::create_dir_all(short.join("02")).unwrap();
+    refused(&short, &["--steps", "5"], "no depth image shows the person");
+    fs::write(short.join("02/000001.exr"), b"nothing").unwrap();
+    refused(&short, &["--steps", "5"], "000001.exr is no depth image: it is damaged or cut off");
+
+    let made = with(&truth, &["--steps", "60"]);
+    assert_eq!(made.code, Some(0), "{made:?}");
+    assert!(made.stdout.contains("depth images show the person in 12 of 12 images"), "{}", made.stdout);
+    let metrics: serde_json::Value =
+        serde_json::from_slice(&fs::read(folder.path().join("m/metrics.json")).unwrap()).unwrap();
+    let [first, last] = ["first", "last"].map(|name| number(&metrics["depth_images_mm"], name));
+    assert!(last > 0.0 && last < 0.8 * first, "{first} to {last} mm");
 }
 
 #[test]

@@ -1,6 +1,6 @@
 //! Tracking of a take's person, with the images that an avatar is fitted to.
 
-use anyhow::{Context as _, Result, bail};
+use anyhow::{Context as _, Result, bail, ensure};
 use flyrig_avatar::{Avatar, KnownPoses, TrainingFrame};
 use flyrig_fit::TrainingView;
 use flyrig_fusion::{BodySettings, Outcome, PersonId, person_surface};
@@ -8,7 +8,9 @@ use flyrig_renderer::HarmonicOrder;
 use flyrig_report::{progress_bar, stop};
 use flyrig_types::{Camera, FrameSet};
 use glam::Vec2;
+use rayon::prelude::*;
 
+use crate::depth_images::DepthFolder;
 use crate::outline_memory::{NodeSurface, remember_outlines};
 use crate::replay::{Replay, frame_number};
 
@@ -92,6 +94,27 @@ impl AvatarTake {
             self.avatar.set_mean(self.frames.iter().map(|frame| frame.translations.as_slice()));
         }
         self
+    }
+
+    /// Adds the surfaces that depth images show to the views, and returns the number of views that have one. `cameras` are those of the
+    /// take.
+    ///
+    /// # Errors
+    /// Those of [`DepthFolder::read`]; no depth image shows the person.
+    pub fn with_depths(mut self, folder: &DepthFolder, cameras: &[Camera]) -> Result<(Self, usize)> {
+        let numbers = &self.numbers;
+        let with = |view: TrainingView| {
+            let camera = cameras.iter().find(|camera| camera.id == view.camera().id);
+            let (Some(camera), Some(number)) = (camera, numbers.get(view.frame())) else { return Ok(view) };
+            Ok(match folder.read(camera, *number)? {
+                Some(depths) => view.with_depths(&depths),
+                None => view,
+            })
+        };
+        self.views = self.views.into_par_iter().map(with).collect::<Result<_>>()?;
+        let count = self.views.iter().filter(|view| view.has_surface()).count();
+        ensure!(count > 0, "no depth image shows the person; check that their numbers are those of the frames");
+        Ok((self, count))
     }
 
     /// Returns the frame of this number alone, whose shape of clothes and hair becomes the avatar's mean.

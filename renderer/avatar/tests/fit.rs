@@ -80,13 +80,18 @@ fn a_fit_explains_its_images_and_the_same_steps_give_the_same_bytes() {
 fn a_fit_that_was_killed_ends_as_one_that_was_not() {
     let gpu = flyrig_gpu::testing::device().on_processor();
     let truth = avatar(|i| [[0.5, 0.1, 0.1], [0.1, 0.4, 0.6], [0.6, 0.6, 0.2]][i / 40 % 3], 1500);
-    let (frames, views) = take(&gpu, &truth);
+    let (mut frames, views) = take(&gpu, &truth);
+    frames.iter_mut().for_each(|frame| frame.translations = truth.hanging.as_ref().unwrap().mean.clone());
     let networks = LocalSettings { stages: 2, layout: AtlasLayout::FrontBack, side: 32, ..LocalSettings::default() };
     let geometry = LocalSettings { colors: false, ..networks.clone() };
     for networks in [None, Some(networks), Some(geometry)] {
         let begin = || {
-            let settings =
-                AvatarFitSettings { refine_poses: true, skin_correction: true, ..AvatarFitSettings::default() };
+            let settings = AvatarFitSettings {
+                refine_poses: true,
+                skin_correction: true,
+                refine_nodes: true,
+                ..AvatarFitSettings::default()
+            };
             let mut model = AvatarModel::new(avatar(|_| [0.2; 3], 1500), frames.clone(), settings);
             if let Some(networks) = &networks {
                 model.use_networks(&[], networks, 1).unwrap();
@@ -163,6 +168,31 @@ fn wrong_poses_are_corrected() {
     let (without, with) = (run(false), run(true));
     assert!(without.0 > 0.02 && with.0 < 0.4 * without.0, "{without:?} {with:?}");
     assert!(with.1 > without.1 + 3.0, "{without:?} {with:?}");
+}
+
+#[test]
+fn wrong_node_translations_of_one_frame_are_corrected() {
+    let gpu = flyrig_gpu::testing::device().on_processor();
+    let truth = avatar(|i| [[0.5, 0.1, 0.1], [0.1, 0.4, 0.6], [0.6, 0.6, 0.2]][i / 40 % 3], 1500);
+    let (mut frames, views) = take(&gpu, &truth);
+    let right = truth.hanging.as_ref().unwrap().mean.clone();
+    frames.iter_mut().for_each(|frame| frame.translations = right.clone());
+    frames[0].translations.iter_mut().for_each(|node| *node += DVec3::new(0.012, 0.0, 0.008));
+    let off = |frames: &[TrainingFrame]| {
+        let rows = frames.iter().flat_map(|frame| frame.translations.iter().zip(&right));
+        rows.map(|(found, right)| found.distance(*right)).sum::<f64>() / (2 * right.len()) as f64
+    };
+    let run = |refine_nodes: bool| {
+        let settings = AvatarFitSettings { refine_nodes, ..AvatarFitSettings::default() };
+        let mut fit = fit_of(&gpu, AvatarModel::new(truth.clone(), frames.clone(), settings), &views);
+        for step in 0..150 {
+            fit.step(step as f32 / 150.0).unwrap();
+        }
+        (fit.decibels().unwrap(), off(&fit.into_model().into_parts().1))
+    };
+    let ((without_db, without), (with_db, with)) = (run(false), run(true));
+    assert!((without - off(&frames)).abs() < 1e-9, "{without}");
+    assert!(with < 0.5 * without && with_db > without_db + 2.0, "{without} {with}, {without_db} {with_db} dB");
 }
 
 #[test]

@@ -12,6 +12,7 @@ use rand::{SeedableRng as _, rngs::StdRng, seq::SliceRandom as _};
 use crate::error::FitError;
 use crate::image_error::{ErrorWeights, ImageDifference};
 use crate::model::{Model, Step};
+use crate::surface_error::{SurfaceDifference, SurfaceWeights};
 use crate::training_view::TrainingView;
 
 /// Multiplier of the round in the seed of its order, which separates the rounds of consecutive seeds.
@@ -24,11 +25,13 @@ pub struct FitSettings {
     pub seed: u64,
     /// Weights of the error's terms.
     pub weights: ErrorWeights,
+    /// Weights of the error against known surfaces, of views that have one.
+    pub surface: SurfaceWeights,
 }
 
 impl Default for FitSettings {
     fn default() -> Self {
-        Self { seed: 1, weights: ErrorWeights::default() }
+        Self { seed: 1, weights: ErrorWeights::default(), surface: SurfaceWeights::default() }
     }
 }
 
@@ -39,6 +42,8 @@ pub struct StepReport {
     pub loss: f64,
     /// PSNR of the step's image, decibels.
     pub decibels: f64,
+    /// Mean distance of the drawn planes from the known surface along the optical axis, metres; `None` for an image without one.
+    pub depth_m: Option<f64>,
 }
 
 /// Rendered image and its derivatives, of one size, on the adapter.
@@ -49,10 +54,20 @@ struct Targets {
 }
 
 impl Targets {
-    fn new(gpu: &GpuContext, [width, height]: [u32; 2]) -> Result<Self, FitError> {
+    fn new(gpu: &GpuContext, [width, height]: [u32; 2], planes: bool) -> Result<Self, FitError> {
         let rendered = RenderTarget::new(gpu, width, height)?;
-        Ok(Self { rendered, slopes: ImageGradients::zeroed(gpu, width, height)? })
+        let slopes = ImageGradients::zeroed(gpu, width, height)?;
+        if !planes {
+            return Ok(Self { rendered, slopes });
+        }
+        Ok(Self { rendered: rendered.with_planes(gpu)?, slopes: slopes.with_planes(gpu)? })
     }
+}
+
+/// Difference of a drawn view from its photograph, and from its known surface.
+struct Difference {
+    image: ImageDifference,
+    surface: Option<SurfaceDifference>,
 }
 
 /// Fit of a model to images.
@@ -85,10 +100,11 @@ impl<M: Model> Fit<M> {
             return Err(FitError::Images("an image is of a frame without a pose".to_owned()));
         }
         let (count, order) = (model.gaussians(), model.order());
+        let planes = views.iter().any(TrainingView::has_surface);
         let mut targets = BTreeMap::new();
         for view in &views {
             if let Entry::Vacant(entry) = targets.entry(view.size()) {
-                entry.insert(Targets::new(gpu, view.size())?);
+                entry.insert(Targets::new(gpu, view.size(), planes)?);
             }
         }
         Ok(Self {
@@ -136,11 +152,15 @@ impl<M: Model> Fit<M> {
     /// [`FitError::Gpu`], [`FitError::Backward`].
     pub fn step(&mut self, progress: f32) -> Result<StepReport, FitError> {
         let index = self.next_view();
-        let error = self.draw(index)?;
+        let Difference { image: mut error, surface } = self.draw(index)?;
         let view = &self.views[index];
         let Some(Targets { rendered, slopes }) = self.targets.get(&view.size()) else {
             return Err(FitError::Images("an image has no target".to_owned()));
         };
+        if let (Some(surface), Some(planes)) = (&surface, &slopes.planes) {
+            error.slope.iter_mut().zip(&surface.coverage).for_each(|(slope, coverage)| slope[3] += coverage);
+            planes.write(&self.gpu, &surface.planes);
+        }
         slopes.color.write(&self.gpu, &error.slope);
         let mut encoder = self.gpu.device.create_command_encoder(&Default::default());
         self.gradients.clear(&mut encoder);
@@ -157,7 +177,11 @@ impl<M: Model> Fit<M> {
         let mut found = read_all(&self.gpu, &self.gradients.attributes())?;
         self.step += 1;
         self.model.descend(view.frame, &mut found, Step { count: self.step, progress });
-        Ok(StepReport { loss: error.loss, decibels: -10.0 * error.squared.max(1e-10).log10() })
+        Ok(StepReport {
+            loss: error.loss + surface.as_ref().map_or(0.0, |surface| surface.loss),
+            decibels: -10.0 * error.squared.max(1e-10).log10(),
+            depth_m: surface.map(|surface| surface.depth_m),
+        })
     }
 
     /// Returns the view of the next step. Rounds are shuffled by their number, so that a fit that resumes from a checkpoint sees the same
@@ -181,13 +205,13 @@ impl<M: Model> Fit<M> {
     pub fn decibels(&mut self) -> Result<f64, FitError> {
         let mut sum = 0.0;
         for view in 0..self.views.len() {
-            sum += self.draw(view)?.squared;
+            sum += self.draw(view)?.image.squared;
         }
         Ok(-10.0 * (sum / self.views.len().max(1) as f64).max(1e-10).log10())
     }
 
-    /// Renders a view and compares it with its photograph.
-    fn draw(&mut self, view: usize) -> Result<ImageDifference, FitError> {
+    /// Renders a view and compares it with its photograph, and with its surface where one is known.
+    fn draw(&mut self, view: usize) -> Result<Difference, FitError> {
         let view = &self.views[view];
         let [center, scale_opacity, rotation, harmonics] =
             self.model.place(view.frame, view.camera.position().as_vec3());
@@ -198,13 +222,23 @@ impl<M: Model> Fit<M> {
         let size = view.size();
         let Targets { rendered, .. } = match self.targets.entry(size) {
             Entry::Occupied(entry) => entry.into_mut(),
-            Entry::Vacant(entry) => entry.insert(Targets::new(&self.gpu, size)?),
+            Entry::Vacant(entry) => entry.insert(Targets::new(&self.gpu, size, view.has_surface())?),
         };
-        let settings = RasterSettings { outputs: Outputs::COLOR, ..RasterSettings::default() };
+        let outputs = if view.has_surface() { Outputs::PLANES } else { Outputs::COLOR };
+        let settings = RasterSettings { outputs, ..RasterSettings::default() };
         let mut encoder = self.gpu.device.create_command_encoder(&Default::default());
         self.rasterizer.encode(&self.gpu, &mut encoder, &self.gaussians, &view.camera, &settings, rendered)?;
         self.gpu.queue.submit([encoder.finish()]);
         let pixels = rendered.color.read(&self.gpu)?;
-        Ok(ImageDifference::of(&pixels, view.photograph(), size[0] as usize, &self.settings.weights))
+        let image = ImageDifference::of(&pixels, view.photograph(), size[0] as usize, &self.settings.weights);
+        let surface = match (&view.surface, &rendered.planes) {
+            (Some(known), Some(planes)) => {
+                let planes = planes.read(&self.gpu)?;
+                let below_m = self.model.below_surface_m();
+                Some(SurfaceDifference::of([&pixels, &planes], known, below_m, view.person(), &self.settings.surface))
+            }
+            _ => None,
+        };
+        Ok(Difference { image, surface })
     }
 }

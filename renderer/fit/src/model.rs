@@ -33,6 +33,12 @@ pub trait Model {
     /// seen from `eye`, world metres. Gaussians of opacity 0 are not drawn and have no derivatives.
     fn place(&mut self, frame: usize, eye: Vec3) -> [&[Element]; 4];
 
+    /// Returns how far the Gaussians' centres, as [`Self::place`] placed them last, lie below the surface that they draw, metres: known depths
+    /// are of that surface, and planes of Gaussians pass through their centres.
+    fn below_surface_m(&self) -> f32 {
+        0.0
+    }
+
     /// Moves the parameters by one step, from the derivatives with respect to the lists that [`Self::place`] returned
     /// last, for the same frame. Derivatives may be changed; those that are not finite count as zero.
     fn descend(&mut self, frame: usize, slopes: &mut [Vec<Element>], step: Step);

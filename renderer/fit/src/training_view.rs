@@ -5,6 +5,7 @@ use std::sync::Arc;
 use flyrig_types::Camera;
 
 use crate::image_error::Photograph;
+use crate::known_surface::KnownSurface;
 use crate::outline::mixed;
 
 /// Margin around the person, pixels.
@@ -21,6 +22,10 @@ pub struct TrainingView {
     rgba: Arc<[u8]>,
     /// Pixels whose colour is mixed with the background.
     mixed: Arc<[bool]>,
+    /// First column and row of the crop, and width and height of the image that it is cut from, pixels.
+    left_top: [u32; 2],
+    whole: [u32; 2],
+    pub(crate) surface: Option<KnownSurface>,
 }
 
 impl TrainingView {
@@ -59,7 +64,30 @@ impl TrainingView {
         let mut camera = camera.clone();
         camera.intrinsics.center_px -= glam::DVec2::new(f64::from(left), f64::from(top));
         (camera.intrinsics.width, camera.intrinsics.height) = (columns, rows);
-        Some(Self { frame, camera, rgba: cut.into(), mixed: mixed.into() })
+        let (left_top, whole) = ([left, top], [width, height]);
+        Some(Self { frame, camera, rgba: cut.into(), mixed: mixed.into(), left_top, whole, surface: None })
+    }
+
+    /// Returns the view with the surface that the depths of its image show of the person: camera-space z in metres for each pixel of the
+    /// whole image, row by row, where what is not finite or not above 0 is unknown. A list of another length changes nothing.
+    #[must_use]
+    pub fn with_depths(self, depths_m: &[f32]) -> Self {
+        let [width, height] = self.whole.map(|side| side as usize);
+        if depths_m.len() != width * height {
+            return self;
+        }
+        let ([left, top], [columns, rows]) =
+            (self.left_top.map(|at| at as usize), self.size().map(|side| side as usize));
+        let row = |y: usize| depths_m[y * width + left..][..columns].iter().copied();
+        let cut: Vec<f32> = (top..top + rows).flat_map(row).collect();
+        let surface = KnownSurface::of_depths(&self.camera, &cut, |at| self.rgba[4 * at + 3] > 127);
+        Self { surface, ..self }
+    }
+
+    /// Returns whether depths show a surface of the person in this view.
+    #[must_use]
+    pub fn has_surface(&self) -> bool {
+        self.surface.is_some()
     }
 
     /// Returns the number of its frame among those of the fit.
@@ -90,6 +118,11 @@ impl TrainingView {
     #[must_use]
     pub fn size(&self) -> [u32; 2] {
         [self.camera.intrinsics.width, self.camera.intrinsics.height]
+    }
+
+    /// Returns the number of the person's pixels, partly covered ones by their share.
+    pub(crate) fn person(&self) -> f64 {
+        self.rgba.chunks_exact(4).map(|pixel| f64::from(pixel[3]) / 255.0).sum()
     }
 
     /// Returns the pixels to compare with.

@@ -256,3 +256,98 @@ fn poison_in_the_model_is_no_poison_in_the_report() {
     let sound = |(i, row): (usize, &Element)| i == 3 || row.iter().all(|value| value.is_finite());
     assert!(fit.into_model().lists.0[0].iter().enumerate().all(sound), "the others go on");
 }
+
+/// Model of one flat Gaussian for each of 20 x 20 places on a wall that faces z, whose surface is drawn 4 mm before its centres.
+struct Wall(Free);
+
+const BELOW_M: f32 = 0.004;
+
+impl Wall {
+    fn new(z: f32) -> Self {
+        let mut lists = Lists(Default::default());
+        for at in 0..400 {
+            let [x, y] = [at % 20, at / 20].map(|k| 0.05 * (k as f32 - 9.5));
+            let turned = glam::Quat::from_rotation_y(0.2);
+            for (list, row) in lists.0.iter_mut().zip([
+                [x, y, z, 0.0],
+                [0.04, 0.04, 0.002, 0.9],
+                turned.to_array(),
+                [0.5, 0.4, 0.3, 0.0],
+            ]) {
+                list.push(row);
+            }
+        }
+        Self(Free::new(lists, 1))
+    }
+}
+
+impl Model for Wall {
+    fn gaussians(&self) -> usize {
+        self.0.gaussians()
+    }
+
+    fn order(&self) -> HarmonicOrder {
+        HarmonicOrder::Zero
+    }
+
+    fn frames(&self) -> usize {
+        1
+    }
+
+    fn place(&mut self, frame: usize, eye: Vec3) -> [&[Element]; 4] {
+        self.0.place(frame, eye)
+    }
+
+    fn below_surface_m(&self) -> f32 {
+        BELOW_M
+    }
+
+    fn descend(&mut self, _: usize, slopes: &mut [Vec<Element>], step: Step) {
+        let rate = 2e-3 * (1.0 - step.progress);
+        let rates = [[rate; 4], [0.0; 4], [5.0 * rate; 4], [0.0; 4]];
+        for (list, rates) in rates.into_iter().enumerate() {
+            self.0.moments[list].descend(step.count, rates, &mut self.0.lists.0[list], &slopes[list]);
+        }
+    }
+
+    fn state(&mut self) -> Vec<(String, &mut [f32])> {
+        self.0.state()
+    }
+
+    fn restore(&mut self, count: u64) {
+        self.0.restore(count);
+    }
+}
+
+#[test]
+fn a_wall_moves_to_where_depths_show_it_and_turns_as_they_do() {
+    on_both(|gpu| {
+        let camera = camera(DVec3::new(0.0, 0.0, 2.0));
+        let whole = vec![200; SIZE as usize * SIZE as usize * 4];
+        let view = TrainingView::cut(0, &camera, &whole).unwrap();
+        // The wall's surface at z = 0.03, 2 m from the camera but for that.
+        let depths = vec![1.97; SIZE as usize * SIZE as usize];
+        let with = view.clone().with_depths(&depths);
+        assert!(with.has_surface() && !view.clone().with_depths(&depths[1..]).has_surface());
+        assert!(!view.clone().with_depths(&vec![f32::NAN; depths.len()]).has_surface());
+        let run = |view: TrainingView| {
+            let mut fit = Fit::new(gpu, Wall::new(0.0), vec![view], FitSettings::default()).unwrap();
+            let reports: Vec<_> = (0..80).map(|step| fit.step(step as f32 / 80.0).unwrap()).collect();
+            (reports[0].depth_m, reports[79].depth_m, fit.into_model().0.lists)
+        };
+        let (first, last, lists) = run(with);
+        assert!((first.unwrap() - 0.026).abs() < 6e-3 && last.unwrap() < 2e-3, "{first:?} {last:?}");
+        let inside = |row: &&Element| row[0].abs() < 0.3 && row[1].abs() < 0.3;
+        for row in lists.0[0].iter().filter(inside) {
+            assert!((row[2] + BELOW_M - 0.03).abs() < 4e-3, "{row:?}");
+        }
+        let rows = lists.0[2].iter().zip(&lists.0[0]).filter(|(_, center)| inside(center));
+        let normals: Vec<Vec3> = rows.map(|(turn, _)| glam::Quat::from_array(*turn).normalize() * Vec3::Z).collect();
+        let cosine = normals.iter().map(|normal| normal.z.abs()).sum::<f32>() / normals.len() as f32;
+        assert!(cosine > 0.995, "{cosine}: 0.98 at the start");
+        let (first, last, without) = run(view);
+        assert_eq!((first, last), (None, None));
+        let still = without.0[0].iter().filter(inside).all(|row| row[2].abs() < 0.02);
+        assert!(still, "depths alone move the wall");
+    });
+}

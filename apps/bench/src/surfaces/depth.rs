@@ -79,6 +79,11 @@ impl DepthImage {
         camera.camera_from_world.transform_point(point).z <= depth + tolerance_m
     }
 
+    /// Returns the depth of each pixel along the optical axis, metres, row by row; infinite where nothing is seen.
+    pub fn depths(&self) -> Vec<f32> {
+        self.depths.iter().map(|depth| *depth as f32).collect()
+    }
+
     /// Returns the world position, metres, and the triangle in each pixel that sees one.
     pub fn points(&self, camera: &Camera) -> Vec<(DVec3, u32)> {
         let forward = camera.camera_from_world.rotation.inverse() * DVec3::Z;

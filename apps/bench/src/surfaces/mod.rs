@@ -6,7 +6,11 @@ mod score;
 mod true_surface;
 mod visibility;
 
-use std::{fmt::Write as _, path::PathBuf, time::Instant};
+use std::{
+    fmt::Write as _,
+    path::{Path, PathBuf},
+    time::Instant,
+};
 
 use anyhow::{Context as _, Result, ensure};
 use clap::Args;
@@ -24,8 +28,9 @@ use serde::Serialize;
 
 use crate::harness::arguments::RecordedArgs;
 use bounds::mesh_of_depths;
+use depth::DepthImage;
 use score::SurfaceScore;
-use true_surface::TrueSurface;
+use true_surface::{TrueSurface, read_surface};
 use visibility::cameras_around;
 
 /// Arguments of the command.
@@ -47,7 +52,7 @@ pub struct BenchSurfacesArgs {
     #[arg(long, default_value_t = 115_000, value_parser = clap::value_parser!(u32).range(1000..=1_000_000))]
     pub gaussians: u32,
     /// Steps of the fit, as in `flyrig mesh`.
-    #[arg(long, default_value_t = 400, value_parser = clap::value_parser!(u64).range(1..=1_000_000))]
+    #[arg(long, default_value_t = 800, value_parser = clap::value_parser!(u64).range(1..=1_000_000))]
     pub steps: u64,
     /// Triangles of the meshes.
     #[arg(long, default_value_t = 40_000, value_parser = clap::value_parser!(u32).range(500..=5_000_000))]
@@ -55,6 +60,12 @@ pub struct BenchSurfacesArgs {
     /// Voxels in place of the default, in parts of it, comma separated.
     #[arg(long, value_delimiter = ',', value_parser = parse_part)]
     pub voxels: Vec<f32>,
+    /// Add the mesh of a fit that also compares the true depths of the input cameras: what perfect depth images are worth.
+    #[arg(long)]
+    pub true_depths: bool,
+    /// Keep the tracked node translations, so that the fit moves the Gaussians alone.
+    #[arg(long)]
+    pub tracked_nodes: bool,
     /// Skip the meshes of the first scored instant alone and of the true depths.
     #[arg(long)]
     pub brief: bool,
@@ -133,29 +144,36 @@ fn score_take(
         triangles: subject.take.avatar.template.triangles.len(),
         mesh_secs: 0.0,
     });
-    let all = |avatar: &Avatar, surface: &str, options: MeshOptions<'_>| {
-        meshed(args, &subject, avatar, (surface, options), &subject.truths)
+    let all = |(avatar, frames): (&Avatar, &[TrainingFrame]), surface: &str, options: MeshOptions<'_>| {
+        meshed(args, &subject, (avatar, frames), (surface, options), &subject.truths)
     };
-    rows.push(all(&subject.take.avatar, "not fitted", MeshOptions::default())?.0);
+    let tracked = subject.take.frames.as_slice();
+    rows.push(all((&subject.take.avatar, tracked), "not fitted", MeshOptions::default())?.0);
     let started = Instant::now();
     let fitted = fit(args, subject.take.clone(), gpu)?;
     let fit_secs = started.elapsed().as_secs_f64();
-    rows.push(all(&fitted, "naive fusion", MeshOptions { fusion: Fusion::Naive, ..MeshOptions::default() })?.0);
-    let (row, voxel_m) = all(&fitted, "Eq. 18", MeshOptions::default())?;
+    let fitted = (&fitted.0, fitted.1.as_slice());
+    rows.push(all(fitted, "naive fusion", MeshOptions { fusion: Fusion::Naive, ..MeshOptions::default() })?.0);
+    let (row, voxel_m) = all(fitted, "Eq. 18", MeshOptions::default())?;
     rows.push(row);
     for part in &args.voxels {
         let options = MeshOptions { voxel_m: Some(voxel_m * part), ..MeshOptions::default() };
-        rows.push(all(&fitted, &format!("Eq. 18, voxels of {:.1} mm", 1e3 * voxel_m * part), options)?.0);
+        rows.push(all(fitted, &format!("Eq. 18, voxels of {:.1} mm", 1e3 * voxel_m * part), options)?.0);
+    }
+    if args.true_depths {
+        let take = with_true_depths(&settings.dataset, &subject)?;
+        let (avatar, frames) = fit(args, take, gpu)?;
+        rows.push(all((&avatar, &frames), "Eq. 18, true depths of the inputs in the fit", MeshOptions::default())?.0);
     }
     if !args.brief {
         let (number, truth) = subject.truths.first().context("no frame is scored")?;
-        let instant = fit(args, subject.tracked.clone().only(*number)?, gpu)?;
-        for (avatar, surface) in [
-            (&fitted, format!("Eq. 18, frame {number}")),
-            (&instant, format!("fitted to frame {number} alone, frame {number}")),
+        let (instant, _) = fit(args, subject.tracked.clone().only(*number)?, gpu)?;
+        for (fitted, surface) in [
+            (fitted, format!("Eq. 18, frame {number}")),
+            ((&instant, tracked), format!("fitted to frame {number} alone, frame {number}")),
         ] {
             let what = (surface.as_str(), MeshOptions::default());
-            rows.push(meshed(args, &subject, avatar, what, &subject.truths[..1])?.0);
+            rows.push(meshed(args, &subject, fitted, what, &subject.truths[..1])?.0);
         }
         for (cameras, what) in
             [(&subject.inputs, "inputs"), (&cameras_around(&truth.positions), "cameras on all sides")]
@@ -218,9 +236,26 @@ fn track(
     Ok((Subject { name: name.to_owned(), take: take.with_outlines(), tracked, truths, inputs }, scores))
 }
 
+/// Returns the take with the true surface in each of its views.
+fn with_true_depths(dataset: &Path, subject: &Subject) -> Result<AvatarTake> {
+    let mut take = subject.take.clone();
+    let mut views = Vec::with_capacity(take.views.len());
+    for (at, number) in take.numbers.iter().enumerate() {
+        let (positions, triangles) = read_surface(dataset, *number)?;
+        views.extend(take.views.iter().filter(|view| view.frame() == at).map(|view| {
+            let camera = subject.inputs.iter().find(|camera| camera.id == view.camera().id);
+            let depths = camera.map(|camera| DepthImage::render(camera, &positions, &triangles).depths());
+            view.clone().with_depths(&depths.unwrap_or_default())
+        }));
+    }
+    take.views = views;
+    Ok(take)
+}
+
 /// Fits the avatar of a take to its images.
-fn fit(args: &BenchSurfacesArgs, take: AvatarTake, gpu: &GpuContext) -> Result<Avatar> {
-    let model = AvatarModel::new(take.avatar, take.frames, AvatarFitSettings::default());
+fn fit(args: &BenchSurfacesArgs, take: AvatarTake, gpu: &GpuContext) -> Result<(Avatar, Vec<TrainingFrame>)> {
+    let settings = AvatarFitSettings { refine_nodes: !args.tracked_nodes, ..AvatarFitSettings::default() };
+    let model = AvatarModel::new(take.avatar, take.frames, settings);
     let mut fit = Fit::new(gpu, model, take.views, FitSettings::default())?;
     let bar = progress_bar(args.steps, "fit");
     for step in (0..args.steps).take_while(|_| !stop::requested()) {
@@ -229,14 +264,14 @@ fn fit(args: &BenchSurfacesArgs, take: AvatarTake, gpu: &GpuContext) -> Result<A
     }
     bar.finish_and_clear();
     ensure!(!stop::requested(), STOPPED);
-    Ok(fit.into_model().into_avatar())
+    Ok(fit.into_model().into_parts())
 }
 
 /// Meshes an avatar and scores the mesh in some frames. Returns also the side of a voxel, metres.
 fn meshed(
     args: &BenchSurfacesArgs,
     subject: &Subject,
-    avatar: &Avatar,
+    (avatar, frames): (&Avatar, &[TrainingFrame]),
     (surface, mesh): (&str, MeshOptions<'_>),
     truths: &[(u64, TrueSurface)],
 ) -> Result<(Row, f32)> {
@@ -249,7 +284,7 @@ fn meshed(
         .iter()
         .filter_map(|(number, truth)| {
             let at = subject.take.numbers.iter().position(|known| known == number)?;
-            let TrainingFrame { pose, translations } = &subject.take.frames[at];
+            let TrainingFrame { pose, translations } = &frames[at];
             let (positions, _): (Vec<Vec3>, _) = person.posed(pose, Some(translations));
             Some(SurfaceScore::of(&positions, &person.template.triangles, truth))
         })

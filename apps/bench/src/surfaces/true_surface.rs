@@ -37,15 +37,23 @@ impl TrueSurface {
     /// # Errors
     /// Names a file that is missing or damaged.
     pub fn read(take: &Path, frame: u64, cameras: &[Camera]) -> Result<Self> {
-        let path = take.join(format!("truth/surface/{frame:06}.ply"));
-        let bytes = std::fs::read(&path).with_context(|| {
-            format!("cannot read {}; `flyrig sim export` writes the true surfaces of a take", path.display())
-        })?;
-        let (positions, triangles) = parse(&bytes).with_context(|| format!("{} is damaged", path.display()))?;
+        let (positions, triangles) = read_surface(take, frame)?;
         let points = Points::on(&positions, &triangles, POINTS);
-        ensure!(!points.points.is_empty(), "{} has no surface", path.display());
+        ensure!(!points.points.is_empty(), "frame {frame} of {} has no true surface", take.display());
         Ok(Self::new(positions, triangles, points, cameras))
     }
+}
+
+/// Reads `truth/surface/NNNNNN.ply` of a take: positions in world metres, and triangles.
+///
+/// # Errors
+/// Names a file that is missing or damaged.
+pub(super) fn read_surface(take: &Path, frame: u64) -> Result<(Vec<Vec3>, Vec<[u32; 3]>)> {
+    let path = take.join(format!("truth/surface/{frame:06}.ply"));
+    let bytes = std::fs::read(&path).with_context(|| {
+        format!("cannot read {}; `flyrig sim export` writes the true surfaces of a take", path.display())
+    })?;
+    parse(&bytes).with_context(|| format!("{} is damaged", path.display()))
 }
 
 /// Parses a binary PLY mesh whose vertices begin with three floats, and whose faces are triangles of 32-bit indices.

@@ -12,10 +12,10 @@ use crate::arguments::DatasetArgs;
 /// Default number of Gaussians, as a rig draws.
 const GAUSSIANS: u32 = 115_000;
 /// Default steps of the fit.
-const STEPS: u64 = 400;
+const STEPS: u64 = 800;
 
 /// Options that apply to takes alone: names in the arguments' definition and on the command line.
-const OF_TAKES: [(&str, &str); 21] = [
+const OF_TAKES: [(&str, &str); 22] = [
     ("inputs", "--inputs"),
     ("frames", "--frames"),
     ("frame", "--frame"),
@@ -37,6 +37,7 @@ const OF_TAKES: [(&str, &str); 21] = [
     ("sequence", "--sequence"),
     ("steps", "--steps"),
     ("gaussians", "--gaussians"),
+    ("depth", "--depth"),
 ];
 
 /// Arguments of `flyrig mesh`.
@@ -62,6 +63,10 @@ pub struct MeshArgs {
     /// Steps in which the Gaussians are fitted to all images of a take; 0 meshes the tracked surface.
     #[arg(long, default_value_t = STEPS, value_parser = clap::value_parser!(u64).range(0..=1_000_000))]
     pub steps: u64,
+    /// Folder of depth images of a take's cameras, which the fit compares the surface with: CAM/000000.exr (channel Z, metres) or
+    /// CAM/000000.png (16-bit grey, millimetres), of a depth camera or another program.
+    #[arg(long, value_name = "FOLDER")]
+    pub depth: Option<PathBuf>,
     /// Fusion of the Gaussians' surfaces into one.
     #[arg(long, value_enum, default_value = "hgm")]
     pub fusion: FusionKind,

@@ -9,7 +9,7 @@ use flyrig_fusion::BodySettings;
 use flyrig_gpu::GpuContext;
 use flyrig_renderer::HarmonicOrder;
 use flyrig_report::{progress_bar, stop};
-use flyrig_takes::{AvatarTake, frame_number};
+use flyrig_takes::{AvatarTake, DepthFolder, frame_number};
 use flyrig_types::PoseTrack;
 use glam::{DQuat, DVec3};
 
@@ -36,6 +36,9 @@ pub(super) struct Source {
     /// Seconds of tracking and of the fit.
     pub tracked_s: f64,
     pub fitted_s: f64,
+    /// Mean distance of the drawn planes from the depth images in the first images of the fit and in the last ones, millimetres; `None` without
+    /// depth images.
+    pub depth_mm: Option<[f64; 2]>,
 }
 
 impl Source {
@@ -58,6 +61,7 @@ impl Source {
                 held_out: None,
                 tracked_s: 0.0,
                 fitted_s: 0.0,
+                depth_mm: None,
             });
         }
         ensure!(
@@ -79,6 +83,10 @@ impl Source {
     }
 
     fn track(args: &MeshArgs, gpu: &GpuContext) -> Result<Self> {
+        ensure!(
+            args.depth.is_none() || args.steps > 0,
+            "--steps 0 fits nothing, and --depth is for the fit: leave out one of them"
+        );
         let started = Instant::now();
         let mut take_args = args.take.resolve("mesh", &args.holdout, gpu)?;
         if let Some(frame) = args.frame {
@@ -89,6 +97,9 @@ impl Source {
         }
         let body = BodySettings { gaussians: args.gaussians as usize, ..BodySettings::default() };
         let mut replay = open_replay(&take_args, &args.holdout, (&body, None), gpu)?;
+        // A folder that cannot be used is found before anything is tracked.
+        let depths =
+            args.depth.as_deref().map(|depth| DepthFolder::open(depth, &replay.session.rig().cameras)).transpose()?;
         let mut found = Vec::new();
         let take = AvatarTake::track(&mut replay, &body, HarmonicOrder::Zero, |_, set| {
             found.push((frame_number(set), set.master_nanos));
@@ -96,13 +107,18 @@ impl Source {
         })
         .with_context(|| format!("no mesh of {}", take_args.dataset.display()))?;
         ensure!(!stop::requested(), "stopped; nothing was written");
-        let take = match args.frame {
+        let mut take = match args.frame {
             Some(frame) => {
                 found.retain(|(number, _)| *number == frame);
                 take.only(frame)?
             }
             None => take.with_outlines(),
         };
+        if let Some(depths) = &depths {
+            let (with_depths, count) = take.with_depths(depths, &replay.session.rig().cameras)?;
+            println!("depth images show the person in {count} of {} images", with_depths.views.len());
+            take = with_depths;
+        }
         let photos = take.views.clone();
         let AvatarTake { frames, views, avatar, numbers, .. } = take;
         let tracked_s = started.elapsed().as_secs_f64();
@@ -110,19 +126,10 @@ impl Source {
         let up = replay.session.rig().world_up;
         let held_out = HeldOut::of(replay, &found);
         let started = Instant::now();
-        let avatar = if args.steps == 0 {
-            avatar
+        let Fitted { avatar, frames, depth_mm } = if args.steps == 0 {
+            Fitted { avatar, frames, depth_mm: None }
         } else {
-            let model = AvatarModel::new(avatar, frames.clone(), AvatarFitSettings::default());
-            let mut fit = Fit::new(gpu, model, views, FitSettings::default())?;
-            let bar = progress_bar(args.steps, "fit");
-            for step in 0..args.steps {
-                ensure!(!stop::requested(), "stopped; nothing was written");
-                fit.step(step as f32 / args.steps as f32)?;
-                bar.inc(1);
-            }
-            bar.finish_and_clear();
-            fit.into_model().into_avatar()
+            fit(args, (avatar, frames), views, gpu)?
         };
         let fitted_s = started.elapsed().as_secs_f64();
         Ok(Self {
@@ -136,8 +143,43 @@ impl Source {
             held_out,
             tracked_s,
             fitted_s,
+            depth_mm,
         })
     }
+}
+
+/// Avatar and frames of a take, fitted to its images.
+struct Fitted {
+    avatar: Avatar,
+    frames: Vec<TrainingFrame>,
+    /// As [`Source::depth_mm`].
+    depth_mm: Option<[f64; 2]>,
+}
+
+/// Fits an avatar and the node translations of its frames to the images of the take.
+fn fit(
+    args: &MeshArgs,
+    (avatar, frames): (Avatar, Vec<TrainingFrame>),
+    views: Vec<TrainingView>,
+    gpu: &GpuContext,
+) -> Result<Fitted> {
+    let settings = AvatarFitSettings { refine_nodes: true, ..AvatarFitSettings::default() };
+    let model = AvatarModel::new(avatar, frames, settings);
+    let mut fit = Fit::new(gpu, model, views, FitSettings::default())?;
+    let bar = progress_bar(args.steps, "fit");
+    let mut depths_mm = Vec::new();
+    for step in 0..args.steps {
+        ensure!(!stop::requested(), "stopped; nothing was written");
+        depths_mm.extend(fit.step(step as f32 / args.steps as f32)?.depth_m.map(|metres| 1e3 * metres));
+        bar.inc(1);
+    }
+    bar.finish_and_clear();
+    let count = fit.images().min(depths_mm.len());
+    let mean = |some: &[f64]| some.iter().sum::<f64>() / some.len() as f64;
+    let ends = || [mean(&depths_mm[..count]), mean(&depths_mm[depths_mm.len() - count..])];
+    let depth_mm = (count > 0).then(ends);
+    let (avatar, frames) = fit.into_model().into_parts();
+    Ok(Fitted { avatar, frames, depth_mm })
 }
 
 /// Returns the times of frames by their ascending numbers, seconds from the first one.

@@ -242,6 +242,7 @@ impl MeshFolder<'_> {
             "dropped": mesh.dropped.total(),
             "texture_from_photographs": self.photos.seen,
             "held_out": self.held_out,
+            "depth_images_mm": self.source.depth_mm.map(|[first, last]| json!({ "first": first, "last": last })),
             "shell": self.report.shell.map(|shell| json!({
                 "wall_share": shell.wall_share,
                 "hidden_share": shell.hidden_share,

@@ -7,6 +7,7 @@ use flyrig_types::Pose;
 use glam::{DVec3, Vec2, Vec3};
 
 use crate::error::AvatarError;
+use crate::fit::node_fit::NodeFit;
 use crate::fit::pose_fit::PoseFit;
 use crate::fit::skin_fit::SkinFit;
 use crate::local::networks::{Local, LocalSettings};
@@ -44,6 +45,8 @@ pub struct AvatarFitSettings {
     pub refine_poses: bool,
     /// Whether the skin weights are corrected during the fit.
     pub skin_correction: bool,
+    /// Whether each frame's node translations are corrected during the fit; only where every frame has them.
+    pub refine_nodes: bool,
 }
 
 impl Default for AvatarFitSettings {
@@ -58,6 +61,7 @@ impl Default for AvatarFitSettings {
             light: true,
             refine_poses: false,
             skin_correction: false,
+            refine_nodes: false,
         }
     }
 }
@@ -102,6 +106,8 @@ pub struct AvatarModel {
     poses: Option<PoseFit>,
     /// `None` where skin weights are not corrected.
     skin: Option<SkinFit>,
+    /// `None` where node translations are not corrected.
+    nodes: Option<NodeFit>,
     neighbors: Neighbors,
     /// Networks that predict the lists; `None` where the lists themselves are learned.
     local: Option<Local>,
@@ -120,6 +126,14 @@ impl AvatarModel {
             light: LightFit::new(),
             poses: settings.refine_poses.then(|| PoseFit::new(frames.len(), joints)),
             skin: settings.skin_correction.then(|| SkinFit::new(&avatar.skin)),
+            nodes: avatar
+                .hanging
+                .as_ref()
+                .filter(|hanging| {
+                    let has_all = |frame: &TrainingFrame| frame.translations.len() == hanging.nodes.len();
+                    settings.refine_nodes && frames.iter().all(has_all)
+                })
+                .map(|hanging| NodeFit::new(frames.len(), &hanging.nodes)),
             neighbors: Neighbors::new(&avatar.places),
             local: None,
             avatar,
@@ -155,6 +169,23 @@ impl AvatarModel {
         self.avatar
     }
 
+    /// Returns the avatar as it is after the last step, and the frames with their corrections.
+    #[must_use]
+    pub fn into_parts(self) -> (Avatar, Vec<TrainingFrame>) {
+        let corrected = |(at, frame): (usize, &TrainingFrame)| TrainingFrame {
+            pose: self.pose(at).unwrap_or_else(|| frame.pose.clone()),
+            translations: self.translations(at),
+        };
+        let frames = self.frames.iter().enumerate().map(corrected).collect();
+        (self.avatar, frames)
+    }
+
+    /// Returns the corrected node translations of a frame; empty without a graph.
+    fn translations(&self, frame: usize) -> Vec<DVec3> {
+        let own = self.frames.get(frame).map_or(&[][..], |frame| &frame.translations);
+        self.nodes.as_ref().map_or_else(|| own.to_vec(), |nodes| nodes.corrected(frame, own))
+    }
+
     /// Returns the corrected pose of a frame; `None` for a missing frame.
     #[must_use]
     pub fn pose(&self, frame: usize) -> Option<Pose> {
@@ -177,6 +208,10 @@ impl AvatarModel {
                 skin.bake(&mut self.avatar.skin);
             }
             self.posed.to_parameters([centers, scales, rotations]);
+            if let (Some(nodes), Some(hanging)) = (&mut self.nodes, &self.avatar.hanging) {
+                let of = (hanging.gaussian_nodes.as_slice(), hanging.gaussian_weights.as_slice());
+                nodes.descend(frame, centers, of, count, progress);
+            }
         }
         if let Some(colors) = slopes.last_mut().filter(|_| self.settings.light) {
             let slopes = self.posed.to_light(&self.avatar, colors);
@@ -199,7 +234,8 @@ impl Model for AvatarModel {
     }
 
     fn place(&mut self, frame: usize, eye: Vec3) -> [&[Element]; 4] {
-        if let (Some(pose), Some(TrainingFrame { translations, .. })) = (self.pose(frame), self.frames.get(frame)) {
+        if let Some(pose) = self.pose(frame) {
+            let translations = self.translations(frame);
             let bones = Bones::new(&self.avatar.template.skeleton, &pose);
             let translations = (!translations.is_empty()).then_some(translations.as_slice());
             self.avatar.pose(&bones, translations, &mut self.posed);
@@ -209,6 +245,10 @@ impl Model for AvatarModel {
         self.posed.facing(eye, &mut self.facing);
         let PosedAvatar { center, rotation, harmonics, .. } = &self.posed;
         [center, &self.facing, rotation, harmonics]
+    }
+
+    fn below_surface_m(&self) -> f32 {
+        self.posed.below_surface_m()
     }
 
     fn descend(&mut self, frame: usize, slopes: &mut [Vec<Element>], step: Step) {
@@ -249,6 +289,10 @@ impl Model for AvatarModel {
         if let Some(poses) = &mut self.poses {
             all.push(("poses".to_owned(), poses.corrections.as_mut_slice()));
             all.push(("poses.squares".to_owned(), poses.squares.as_mut_slice()));
+        }
+        if let Some(nodes) = &mut self.nodes {
+            all.push(("nodes".to_owned(), nodes.corrections.as_flattened_mut()));
+            all.push(("nodes.squares".to_owned(), nodes.squares.as_mut_slice()));
         }
         if let Some(skin) = &mut self.skin {
             all.push(("skin".to_owned(), skin.factors.as_flattened_mut()));

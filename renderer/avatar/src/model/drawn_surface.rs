@@ -30,6 +30,18 @@ impl SurfacePoint {
 }
 
 impl PosedAvatar {
+    /// Returns how far the centres usually lie below the surface that the Gaussians draw, metres: the median; 0 without a finite one.
+    #[must_use]
+    pub fn below_surface_m(&self) -> f32 {
+        let depths = self.surface_points().map(|point| DRAWN_BEYOND * point.thickness_m);
+        let mut depths: Vec<f32> = depths.filter(|depth| depth.is_finite()).collect();
+        if depths.is_empty() {
+            return 0.0;
+        }
+        let middle = depths.len() / 2;
+        *depths.select_nth_unstable_by(middle, f32::total_cmp).1
+    }
+
     /// Returns the Gaussians as pieces of a surface, in their order. The surface that is drawn lies some deviations beyond the centres
     /// ([`SurfacePoint::thickness_m`]): an outline ends where alpha falls to one half.
     pub fn surface_points(&self) -> impl Iterator<Item = SurfacePoint> + '_ {
@@ -81,6 +93,11 @@ mod tests {
         avatar.parameters.rotation[7] = turned.to_array();
         let upright = points(&avatar)[7].thickness_m;
         assert!((upright / flat - 2.0).abs() < 1e-3, "{upright} {flat}");
+        // The usual depth is that of most of them.
+        let mut posed = PosedAvatar::default();
+        avatar.pose(&Bones::at_rest(&template.skeleton), None, &mut posed);
+        assert!((posed.below_surface_m() / (DRAWN_BEYOND * flat) - 1.0).abs() < 0.3, "{}", posed.below_surface_m());
+        assert!(PosedAvatar::default().below_surface_m().abs() <= 0.0);
         // A poisoned one is no finite point.
         avatar.parameters.rotation[7] = [f32::NAN; 4];
         assert!(!points(&avatar)[7].drawn(DRAWN_BEYOND).is_finite());
