@@ -75,7 +75,8 @@ impl NodeFit {
             *square = BETA * *square + (1.0 - BETA) * slope.length_squared();
         }
         let floor = SHARE * (usual(&self.squares) / unbias).sqrt() + 1e-12;
-        let rate = RATE_M[0] * (RATE_M[1] / RATE_M[0]).powf(progress.clamp(0.0, 1.0));
+        let progress = if progress.is_finite() { progress.clamp(0.0, 1.0) } else { 0.0 };
+        let rate = RATE_M[0] * (RATE_M[1] / RATE_M[0]).powf(progress);
         let own = self.row(frame).to_vec();
         let beside: Vec<&[Element]> = [frame.checked_sub(1), Some(frame + 1)]
             .into_iter()
