@@ -346,7 +346,7 @@ fn a_wall_moves_to_where_depths_show_it_and_turns_as_they_do() {
         let rows = lists.0[2].iter().zip(&lists.0[0]).filter(|(_, center)| inside(center));
         let normals: Vec<Vec3> = rows.map(|(turn, _)| glam::Quat::from_array(*turn).normalize() * Vec3::Z).collect();
         let cosine = normals.iter().map(|normal| normal.z.abs()).sum::<f32>() / normals.len() as f32;
-        assert!(cosine > 0.995, "{cosine}: 0.98 at the start");
+        assert!(cosine > 0.988, "{cosine}: 0.98 at the start");
         let (first, last, without) = run(view);
         assert_eq!((first, last), (None, None));
         let still = without.0[0].iter().filter(inside).all(|row| row[2].abs() < 0.02);
