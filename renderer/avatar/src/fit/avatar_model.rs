@@ -169,14 +169,18 @@ impl AvatarModel {
         self.avatar
     }
 
-    /// Returns the avatar as it is after the last step, and the frames with their corrections.
+    /// Returns the avatar as it is after the last step, and the frames with their corrections. The mean of corrected node translations
+    /// becomes the avatar's.
     #[must_use]
-    pub fn into_parts(self) -> (Avatar, Vec<TrainingFrame>) {
+    pub fn into_parts(mut self) -> (Avatar, Vec<TrainingFrame>) {
         let corrected = |(at, frame): (usize, &TrainingFrame)| TrainingFrame {
             pose: self.pose(at).unwrap_or_else(|| frame.pose.clone()),
             translations: self.translations(at),
         };
-        let frames = self.frames.iter().enumerate().map(corrected).collect();
+        let frames: Vec<TrainingFrame> = self.frames.iter().enumerate().map(corrected).collect();
+        if self.nodes.is_some() {
+            self.avatar.set_mean(frames.iter().map(|frame| frame.translations.as_slice()));
+        }
         (self.avatar, frames)
     }
 

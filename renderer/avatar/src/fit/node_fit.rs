@@ -7,6 +7,8 @@ use flyrig_fit::{Element, Neighbors};
 use glam::{DVec3, Vec3};
 use rayon::prelude::*;
 
+use crate::fit::pose_fit::usual;
+
 /// Rates at the start and at the end, metres.
 const RATE_M: [f32; 2] = [6e-3, 6e-4];
 /// Differences at which the pull equals the usual derivative of the images, metres: to the neighbouring nodes, to the
@@ -124,13 +126,6 @@ impl NodeFit {
 
 fn vector([x, y, z, _]: &Element) -> Vec3 {
     Vec3::new(*x, *y, *z)
-}
-
-/// Returns the mean square over the nodes that ever had a derivative.
-fn usual(squares: &[f32]) -> f32 {
-    let (sum, count) =
-        squares.iter().filter(|v| **v > 0.0).fold((0.0f64, 0u32), |(sum, n), v| (sum + f64::from(*v), n + 1));
-    (sum / f64::from(count.max(1))) as f32
 }
 
 #[cfg(test)]

@@ -153,7 +153,7 @@ impl PoseFit {
 }
 
 /// Returns the mean square over the numbers that ever had a derivative.
-fn usual(squares: &[f32]) -> f32 {
+pub(crate) fn usual(squares: &[f32]) -> f32 {
     let (sum, count) =
         squares.iter().filter(|v| **v > 0.0).fold((0.0f64, 0u32), |(sum, n), v| (sum + f64::from(*v), n + 1));
     (sum / f64::from(count.max(1))) as f32
