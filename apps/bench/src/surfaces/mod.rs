@@ -167,10 +167,15 @@ fn score_take(
     }
     if !args.brief {
         let (number, truth) = subject.truths.first().context("no frame is scored")?;
-        let (instant, _) = fit(args, subject.tracked.clone().only(*number)?, gpu)?;
+        let (instant, own) = fit(args, subject.tracked.clone().only(*number)?, gpu)?;
+        // Its only frame in the place of the tracked one.
+        let mut frames = tracked.to_vec();
+        if let Some(at) = subject.take.numbers.iter().position(|known| known == number) {
+            frames.splice(at..=at, own);
+        }
         for (fitted, surface) in [
             (fitted, format!("Eq. 18, frame {number}")),
-            ((&instant, tracked), format!("fitted to frame {number} alone, frame {number}")),
+            ((&instant, frames.as_slice()), format!("fitted to frame {number} alone, frame {number}")),
         ] {
             let what = (surface.as_str(), MeshOptions::default());
             rows.push(meshed(args, &subject, fitted, what, &subject.truths[..1])?.0);
