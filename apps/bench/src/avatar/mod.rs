@@ -16,7 +16,7 @@ use clap::{Args, builder::TypedValueParser as _};
 use flyrig_avatar::{Avatar, AvatarFitSettings, AvatarModel, AvatarScene, Bones};
 use flyrig_body::DEFAULT_GAUSSIAN_COUNT;
 use flyrig_fit::Fit;
-use flyrig_fusion::{BudgetSettings, Origin, Outcome, PersonId, Solver, resident_mib};
+use flyrig_fusion::{BudgetSettings, Origin, Outcome, PersonId, resident_mib};
 use flyrig_gpu::GpuContext;
 use flyrig_metrics::{CameraScore, ScoreSheet, score_view};
 use flyrig_renderer::HarmonicOrder;
@@ -93,6 +93,8 @@ struct Row {
     view: CameraScore,
     /// Scores in other frames, driven by the pose alone.
     pose: CameraScore,
+    /// Scores in other frames, with the tracked deformation.
+    moved: CameraScore,
 }
 
 /// Run time and memory of an avatar, or of the person as it is rendered live.
@@ -134,7 +136,6 @@ pub fn avatar(args: &BenchAvatarArgs, gpu: &GpuContext) -> Result<()> {
         let (take, held, cameras, track_secs) = track(args, &settings(gaussians, &fitted), gpu)?;
         if others.is_none() {
             let mut settings = settings(gaussians, &args.novel);
-            settings.session.tracking.solver = Solver::None;
             settings.body = Some(take.avatar.template.clone().into());
             others = Some(track(args, &settings, gpu)?.1);
         }
@@ -311,9 +312,10 @@ fn fit(
         let avatar = fit.model().avatar();
         let view = scored((avatar, &mut scene), held, cameras, true)?;
         let (pose, _) = scored((avatar, &mut scene), novel, cameras, false)?;
+        let (moved, _) = scored((avatar, &mut scene), novel, cameras, true)?;
         bar.set_message(format!("{} {gaussians}: {:.2} and {:.2} dB", variant.name(), view.0.psnr_db, pose.psnr_db));
         (times, psnr_db) = (view.1, view.0.psnr_db);
-        rows.push(Row { variant: variant.name(), gaussians, seconds: spent, steps, view: view.0, pose });
+        rows.push(Row { variant: variant.name(), gaussians, seconds: spent, steps, view: view.0, pose, moved });
     }
     bar.finish_and_clear();
     let avatar = fit.into_model().into_avatar();
@@ -335,15 +337,21 @@ fn fit(
 
 fn table(rows: &[Row], costs: &[Cost]) -> String {
     let mut text = String::from(
-        "| variant | Gaussians | seconds of fitting | steps | novel view: PSNR dB | SSIM | FLIP | IoU | novel pose: PSNR dB | SSIM | FLIP | IoU |\n\
-         |---|---|---|---|---|---|---|---|---|---|---|---|\n",
+        "| variant | Gaussians | seconds of fitting | steps | novel view: PSNR dB | SSIM | FLIP | IoU | novel pose: PSNR dB | SSIM | FLIP | IoU | novel pose, tracked: PSNR dB | SSIM | FLIP | IoU |\n\
+         |---|---|---|---|---|---|---|---|---|---|---|---|---|---|---|---|\n",
     );
     let of = |score: &CameraScore| {
         let CameraScore { psnr_db, ssim, flip, iou, .. } = score;
         format!("{psnr_db:.2} | {ssim:.4} | {flip:.4} | {:.4}", iou.unwrap_or(f64::NAN))
     };
-    for Row { variant, gaussians, seconds, steps, view, pose } in rows {
-        let _ = writeln!(text, "| {variant} | {gaussians} | {seconds:.0} | {steps} | {} | {} |", of(view), of(pose));
+    for Row { variant, gaussians, seconds, steps, view, pose, moved } in rows {
+        let _ = writeln!(
+            text,
+            "| {variant} | {gaussians} | {seconds:.0} | {steps} | {} | {} | {} |",
+            of(view),
+            of(pose),
+            of(moved)
+        );
     }
     text += "\n| drawn | Gaussians | tracking s | ms per step | posing ms | view ms | file MB | resident MiB | novel view dB |\n|---|---|---|---|---|---|---|---|---|\n";
     let number =
@@ -395,7 +403,7 @@ fn table(rows: &[Row], costs: &[Cost]) -> String {
 fn plot(rows: &[Row]) -> Plot {
     let mut series: Vec<Series> = Vec::new();
     for row in rows.iter().filter(|row| row.steps > 0) {
-        for (what, score) in [("novel view", &row.view), ("novel pose", &row.pose)] {
+        for (what, score) in [("novel view", &row.view), ("novel pose", &row.pose), ("novel pose, tracked", &row.moved)] {
             let name = format!("{}, {} Gaussians, {what}", row.variant, row.gaussians);
             let point = (row.seconds, score.psnr_db, String::new());
             match series.iter_mut().find(|series| series.name == name) {

@@ -19,6 +19,8 @@ pub enum Variant {
     SkinCorrection,
     /// `direct` with both corrections.
     RefineBoth,
+    /// `direct` with corrections of each frame's node translations.
+    RefineNodes,
     /// `direct` with the error of fine detail (unsharp mask).
     Sharpen,
     /// Shared networks and an atlas of colours (LoGAvatar Eq. 11 to 14).
@@ -72,6 +74,7 @@ impl Variant {
             Self::NoPull | Self::LogavatarNoPull => AvatarFitSettings { pull: 0.0, ..base },
             Self::RefinePoses => AvatarFitSettings { refine_poses: true, ..base },
             Self::SkinCorrection => AvatarFitSettings { skin_correction: true, ..base },
+            Self::RefineNodes => AvatarFitSettings { refine_nodes: true, ..base },
             Self::RefineBoth => AvatarFitSettings { refine_poses: true, skin_correction: true, ..base },
             _ => base,
         }

@@ -17,7 +17,7 @@ use crate::{
     finish::finish,
     mesh_atlas, mesh_from_points,
     person::hang::hang,
-    person::skirt::{Hollow, Side, StandIns},
+    person::skirt::{Hollow, Side, StandIns, covered},
     skin::{Origin, skin_weights, skin_weights_by},
 };
 
@@ -116,9 +116,12 @@ impl MeshedPerson {
     pub fn of_avatar(avatar: &Avatar, options: &PersonOptions<'_>) -> Result<(Self, PersonReport), PersonError> {
         let mut posed = PosedAvatar::default();
         avatar.pose(&Bones::at_rest(&avatar.template.skeleton), None, &mut posed);
-        let points = drawn_points(&posed);
+        let mut points = drawn_points(&posed);
         let started = Instant::now();
         let undressed = avatar.undressed.as_ref();
+        if let Some(body) = undressed {
+            drop_covered(avatar, body, &mut points)?;
+        }
         let hollow = match undressed {
             Some(body) => hollow_of(avatar, body, &points, &options.mesh)?,
             None => None,
@@ -254,6 +257,15 @@ fn drawn_points(posed: &PosedAvatar) -> Vec<OrientedPoint> {
     drawn.collect()
 }
 
+/// Takes the weight from the points of the trunk below a waistband.
+fn drop_covered(avatar: &Avatar, body: &Template, points: &mut [OrientedPoint]) -> Result<(), PersonError> {
+    body.check()?;
+    avatar.template.check_same_joints(body)?;
+    let covered = covered(avatar, body, points);
+    points.iter_mut().zip(covered).filter(|(_, covered)| *covered).for_each(|(point, _)| point.weight = 0.0);
+    Ok(())
+}
+
 /// Returns the space below an avatar's skirt, for the voxels that its points are fused in; `None` without a skirt.
 fn hollow_of(
     avatar: &Avatar,
@@ -261,8 +273,6 @@ fn hollow_of(
     points: &[OrientedPoint],
     options: &MeshOptions<'_>,
 ) -> Result<Option<Hollow>, PersonError> {
-    body.check()?;
-    avatar.template.check_same_joints(body)?;
     if !Hollow::is_below(&avatar.template, body) {
         return Ok(None);
     }

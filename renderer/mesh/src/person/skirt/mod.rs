@@ -10,7 +10,7 @@ mod thin;
 
 use std::collections::HashSet;
 
-use flyrig_avatar::Avatar;
+use flyrig_avatar::{Attachment, Avatar};
 use flyrig_body::{Part, Template};
 use glam::{Vec2, Vec3};
 
@@ -177,6 +177,25 @@ impl Hollow {
         let is_inner = depth_m > 2.0 * SHEET_M && normal.dot(skirt.normal) < OUTWARDS;
         if is_inner && !(point.y < self.hem_y && on_leg(0.5 * self.voxel_m)) { Side::Wall } else { Side::Seen }
     }
+}
+
+/// Returns which points lie on the strip of the trunk that a waistband covers; `points` are as of [`Hollow::of`]. The fusion of that strip and
+/// of a waistband that hangs in front of it would be a surface between them, with a gap below.
+pub(super) fn covered(avatar: &Avatar, body: &Template, points: &[OrientedPoint]) -> Vec<bool> {
+    let template = &avatar.template;
+    let worn = skirt_vertices(template, body);
+    let corners = |attachment: &Attachment| template.triangles.get(attachment.triangle as usize);
+    let rows = || points.iter().zip(&avatar.attachments).filter_map(|(point, of)| Some((point, corners(of)?)));
+    let of_skirt = rows().filter(|(_, corners)| corners.iter().all(|i| worn[*i as usize]));
+    let sheet = of_skirt.filter_map(|(point, _)| Some((point.position, point.normal.try_normalize()?)));
+    let sheet = SignedPoints::new(sheet.filter(|(place, _)| place.is_finite()).collect(), BELOW_BAND_M);
+    let band_y = (0..worn.len()).filter(|i| worn[*i]).map(|i| template.positions[i].y).fold(f32::MIN, f32::max);
+    let is_below = |i: usize| !worn[i] && template.parts[i] == Part::Torso && template.positions[i].y < band_y;
+    let is_covered = |(point, of): (&OrientedPoint, &Attachment)| {
+        let is_strip = corners(of).is_some_and(|corners| corners.iter().all(|i| is_below(*i as usize)));
+        is_strip && sheet.at(point.position).is_some_and(|skirt| skirt.distance_m < 0.0)
+    };
+    points.iter().zip(&avatar.attachments).map(is_covered).collect()
 }
 
 /// Returns which vertices of a dressed body belong to its skirt: those of the trunk that the body does not have.

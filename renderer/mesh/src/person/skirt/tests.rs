@@ -174,3 +174,47 @@ fn poisoned_inputs_are_refused_or_left_out() {
     avatar.attachments.fill(Attachment { triangle: u32::MAX, barycentric: [1.0, 0.0, 0.0] });
     assert!(Hollow::of(&avatar, &body, &points(&avatar), 0.01).is_none(), "no point belongs to the skirt");
 }
+
+#[test]
+fn a_waistband_that_hangs_in_front_of_the_trunk_leaves_no_gap_below_it() {
+    let body = body();
+    let dressed = WORN.on(&body).unwrap();
+    let worn = skirt_vertices(&dressed, &body);
+    // The skirt hangs 2 cm in front, as its tracked nodes may, more at the hem.
+    let band = (0..worn.len()).filter(|i| worn[*i]).map(|i| dressed.positions[i].y).fold(-9.0, f32::max);
+    let mut hanging = dressed.clone();
+    for i in (0..worn.len()).filter(|i| worn[*i]) {
+        let below = ((band - dressed.positions[i].y) / 0.05).clamp(0.0, 1.0);
+        hanging.positions[i] += 0.02 * below * dressed.normals[i].with_y(0.0).normalize_or_zero();
+    }
+    let avatar = avatar_of(&hanging);
+    let mut posed = flyrig_avatar::PosedAvatar::default();
+    avatar.pose(&flyrig_avatar::Bones::at_rest(&hanging.skeleton), None, &mut posed);
+    let points: Vec<OrientedPoint> = crate::person::drawn_points(&posed);
+    let covered = covered(&avatar, &body, &points);
+    let rows = || points.iter().zip(&avatar.attachments).zip(&covered);
+    let count = rows().filter(|(_, covered)| **covered).count();
+    assert!(count > 100, "{count}");
+    for ((point, attachment), _) in rows().filter(|(_, covered)| **covered) {
+        let corners = hanging.triangles[attachment.triangle as usize];
+        assert!(corners.iter().all(|i| !worn[*i as usize] && hanging.parts[*i as usize] == Part::Torso));
+        assert!(point.position.y < band && point.position.y > band - 0.09, "{point:?} {band}");
+    }
+    // Two centimetres below the end of the strip, nothing lies between the skirt and the middle of the body.
+    let (person, report) = meshed(&avatar, Some(&body));
+    assert!(report.topology.is_closed_manifold() && report.topology.components == 1, "{:?}", report.topology);
+    let mut off = Vec::new();
+    for (i, place) in hanging.positions.iter().enumerate() {
+        if worn[i] && (band - 0.09..band - 0.03).contains(&place.y) {
+            off.push(nearest(place.as_dvec3(), person.template.positions.iter().copied()));
+        }
+    }
+    off.sort_by(f64::total_cmp);
+    assert!(off.len() > 60 && off[off.len() * 19 / 20] < 0.01, "{off:?}");
+    // Poison is not covered, and a body without a skirt covers nothing.
+    let mut broken = points.clone();
+    broken[0].position = Vec3::NAN;
+    broken[1].normal = Vec3::ZERO;
+    assert_eq!(super::covered(&avatar, &body, &broken).len(), points.len());
+    assert!(!super::covered(&avatar_of(&body), &body, &points).contains(&true));
+}
