@@ -403,7 +403,8 @@ fn table(rows: &[Row], costs: &[Cost]) -> String {
 fn plot(rows: &[Row]) -> Plot {
     let mut series: Vec<Series> = Vec::new();
     for row in rows.iter().filter(|row| row.steps > 0) {
-        for (what, score) in [("novel view", &row.view), ("novel pose", &row.pose), ("novel pose, tracked", &row.moved)] {
+        for (what, score) in [("novel view", &row.view), ("novel pose", &row.pose), ("novel pose, tracked", &row.moved)]
+        {
             let name = format!("{}, {} Gaussians, {what}", row.variant, row.gaussians);
             let point = (row.seconds, score.psnr_db, String::new());
             match series.iter_mut().find(|series| series.name == name) {

@@ -257,7 +257,7 @@ fn drawn_points(posed: &PosedAvatar) -> Vec<OrientedPoint> {
     drawn.collect()
 }
 
-/// Takes the weight from the points of the trunk below a waistband.
+/// Takes the weight from the points of the body below a waistband.
 fn drop_covered(avatar: &Avatar, body: &Template, points: &mut [OrientedPoint]) -> Result<(), PersonError> {
     body.check()?;
     avatar.template.check_same_joints(body)?;

@@ -179,7 +179,7 @@ impl Hollow {
     }
 }
 
-/// Returns which points lie on the strip of the trunk that a waistband covers; `points` are as of [`Hollow::of`]. The fusion of that strip and
+/// Returns which points lie on the strip of the body that a waistband covers; `points` are as of [`Hollow::of`]. The fusion of that strip and
 /// of a waistband that hangs in front of it would be a surface between them, with a gap below.
 pub(super) fn covered(avatar: &Avatar, body: &Template, points: &[OrientedPoint]) -> Vec<bool> {
     let template = &avatar.template;
@@ -190,7 +190,10 @@ pub(super) fn covered(avatar: &Avatar, body: &Template, points: &[OrientedPoint]
     let sheet = of_skirt.filter_map(|(point, _)| Some((point.position, point.normal.try_normalize()?)));
     let sheet = SignedPoints::new(sheet.filter(|(place, _)| place.is_finite()).collect(), BELOW_BAND_M);
     let band_y = (0..worn.len()).filter(|i| worn[*i]).map(|i| template.positions[i].y).fold(f32::MIN, f32::max);
-    let is_below = |i: usize| !worn[i] && template.parts[i] == Part::Torso && template.positions[i].y < band_y;
+    let is_below = |i: usize| {
+        let below_m = band_y - template.positions[i].y;
+        !worn[i] && !is_arm(template.parts[i]) && (0.0..BELOW_BAND_M).contains(&below_m)
+    };
     let is_covered = |(point, of): (&OrientedPoint, &Attachment)| {
         let is_strip = corners(of).is_some_and(|corners| corners.iter().all(|i| is_below(*i as usize)));
         is_strip && sheet.at(point.position).is_some_and(|skirt| skirt.distance_m < 0.0)
